@@ -110,7 +110,7 @@ def test_the_text_names_rows_and_the_remedy():
     assert lines[-5:-2] == [["5", "-inf", "0", "1"], ["3", "-3.25", "3", "5"], ["4", "+0.10", "4", "3"]]
     assert text.endswith(
         "Not converged: 2 of 4 links changed by more than 0.5 dB (fidelity.tolerance_db); "
-        "raise trace.samples to 1000 or more and check again."
+        "increase trace.samples to 1000 or more and check again."
     )
     still = Convergence(500, np.full(4, 0.004), np.ones(4, dtype=int), np.ones(4, dtype=int))
     text = render(*report.convergence(still, np.arange(2, 6), 0.5))

@@ -92,7 +92,7 @@ def test_what_the_study_states_is_no_finding(stated, kind):
         ({"max_depth": 2}, "set in [trace]: refraction = true, diffraction = true, max_depth = 3."),
         ({"max_depth": 2, "diffraction": True}, "set in [trace]: refraction = true, max_depth = 3."),
         ({"max_depth": 5, "refraction": True, "diffraction": True}, "set in [trace]: max_depth = 6."),
-        ({"max_depth": 100, "refraction": True, "diffraction": True}, "The intervals account for it."),
+        ({"max_depth": 100, "refraction": True, "diffraction": True}, "The intervals account for this."),
     ],
 )
 def test_the_remark_on_errors_out_of_sight_advises_what_the_study_lacks(trace, advice):

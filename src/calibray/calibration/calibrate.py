@@ -1,4 +1,4 @@
-"""Calibrate a study: open it, search, trace again, assess the uncertainty, validate, and make the result."""
+"""Calibrate a study: open the study, search, trace again, assess the uncertainty, validate, and make the result."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def calibrate(
         engine: Engine for all links of the study; if None, the engine that the study specifies.
         workers: Workers from `engines.open_workers`. They run the calls of a batch with the engine "command", or the
             chunks of links with the engine "replay". If None, everything runs in this process.
-        progress: Called with the name of each stage, the work done and the total.
+        progress: Called with the name of each stage, the completed work and the total.
         tracer: Function that opens the scene in a ray tracer; not used for an opened study.
         overwrite: Replace files in `out` even if Calibray did not write them; input files are never replaced.
         cheap_model: A study with the same links and materials. Its replay is used as the cheap model of an expensive

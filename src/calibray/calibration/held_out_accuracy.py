@@ -39,10 +39,10 @@ from calibray.validation.validation import Validation
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """Path loss at all links by each model [links], [dB].
+    """Path loss of all links according to each model [links], [dB].
 
     Attributes:
-        initial: Initial materials, no nuisance.
+        initial: Initial materials without nuisances.
         nuisance_only: Initial materials with fitted nuisances.
         calibrated: Calibrated materials with fitted nuisances.
         log_distance: The log-distance model.
@@ -101,7 +101,7 @@ def on_held_out_links(
 
 
 def _compared(problem: Problem, models: Models) -> dict[str, NDArray[np.float64]]:
-    """Path loss at all links by the calibrated model and every baseline [links], [dB]."""
+    """Path loss of all links according to the calibrated model and every baseline [links], [dB]."""
     objective, setup = problem.objective, problem.setup
     return {
         Model.INITIAL: initial_objective(objective, setup).with_nuisance(problem.before),

@@ -63,7 +63,7 @@ class LinkDiagnostics:
 
 
 def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> LinkDiagnostics:
-    """Diagnostics of the links at calibrated values [d], without columns that the engine cannot provide.
+    """Compute diagnostics of the links at calibrated values [d], without columns that the engine cannot provide.
 
     `paths` are the calibration's paths at the study's carrier, if available.
     """
@@ -118,7 +118,7 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leverage of each link [m]: how closely its modelled value follows its own measurement.
+    """Leverage of each link [m]: the derivative of its modelled value with respect to its own measurement.
 
     Leverage is the diagonal of the projection onto two sets of columns: the derivatives of the residuals, with the
     nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. It is 0 for a link
@@ -180,7 +180,7 @@ def _chunk_power(chunk: Chunk, materials: dict[str, Material]) -> _Power:
 
 
 FEWEST_CLUSTERS: Final = 8
-"""Smallest number of clusters with links inside and outside a group."""
+"""Smallest number of clusters that contain links both inside and outside a group."""
 
 MIXED: Final = 0.5
 """Smallest share of the variance of membership that lies within clusters; with a smaller share, the group is a
@@ -190,8 +190,8 @@ SIGNIFICANCE: Final = 0.01
 """Probability of a false remark about any group of any column, or about any antenna direction."""
 
 SMALLEST_DB: Final = 0.05
-"""Smallest improvement of the RMSE for which a group or a direction is reported [dB]; a smaller one does not change
-predictions noticeably."""
+"""Smallest improvement of the RMSE for which a group or a direction is reported [dB]; smaller improvements do not
+change predictions noticeably."""
 
 
 @dataclass(frozen=True)
@@ -326,7 +326,7 @@ MOST: Final = 50
 
 
 class Direction(NamedTuple):
-    """Changes of the stated angles of a transmitter that would explain its residuals, with standard errors [deg]."""
+    """Changes of a transmitter's stated angles that would explain its residuals, with their standard errors [deg]."""
 
     azimuth: float
     azimuth_error: float
@@ -335,7 +335,7 @@ class Direction(NamedTuple):
 
 
 def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
-    """Test whether the loss of a region, such as unmapped trees, would explain the residuals of a calibration.
+    """Test whether the loss in a region, such as unmapped trees, would explain the residuals of a calibration.
 
     The links must have positions. A common loss of links out of sight is fitted first.
     """
@@ -488,7 +488,7 @@ class _Posed:
 def _direction(
     evaluation: Evaluation, columns: dict[str, int], label: str, freedom: int, significance: float
 ) -> Direction | None:
-    """The direction that explains the residuals of one transmitter; None if it is not significant."""
+    """The change of direction that explains the residuals of one transmitter; None if it is not significant."""
     residuals, slopes = evaluation.residuals[0], evaluation.slopes[0]
     own = [columns[f"{POSE}{label}.{field}"] for field in ("azimuth", "downtilt", "gain")]
     common = [column for name, column in columns.items() if not name.startswith(POSE)]

@@ -1,4 +1,4 @@
-"""Make the result of a finished run: accuracy compared with baselines, intervals, and a row for every link."""
+"""Make the result of a finished run, with its accuracy compared with baselines, intervals, and a row for every link."""
 
 from __future__ import annotations
 
@@ -78,11 +78,12 @@ class Run:
     Attributes:
         problem: The problem, with the paths of the last trace.
         trail: The search.
-        retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
+        retrace_gap_db: Change of every link's path loss when the scene is traced again [links], [dB]; None if it is not
+            traced again.
         cheap: The cheap model, if the method used one.
         enclosed: Antennas inside closed bodies; None if this was not checked.
         on_links: Remarks on ray mapping, links without a path, directions of antennas, and groups of links.
-        timing: Time taken by its parts.
+        timing: Times taken by the parts of the run.
     """
 
     problem: Problem
@@ -200,7 +201,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
 def _retraced(
     gap_db: NDArray[np.float64] | None, counted: NDArray[np.bool_], tolerance_db: float
 ) -> tuple[Remark, ...]:
-    """A remark if the path loss of links [L] changes by more than the tolerance in a new trace."""
+    """A remark if the path loss of any link [L] changes by more than the tolerance in a new trace."""
     if gap_db is None or not (np.abs(gap_db[counted]) > tolerance_db).any():
         return ()
     change_db = np.abs(gap_db[counted])
@@ -215,7 +216,7 @@ def _retraced(
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:
-    """A remark that no link was held out, if blocks can be held out at little cost."""
+    """A remark that no link was held out, if the study allows blocks to be held out."""
     if accuracy.judgement is None and study.allows_blocks:
         return (Remark(RemarkKind.NOT_JUDGED),)
     return ()
@@ -250,7 +251,7 @@ def _residual_field(
 
 
 def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
-    """Coefficients by term and group, and the groups whose offset no calibration link determines."""
+    """Coefficients by term and group, and the groups with an offset that no calibration link determines."""
     objective = problem.objective
     by_term = objective.nuisance.by_term(coefficients, objective.determined)
     without_path = [

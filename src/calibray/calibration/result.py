@@ -54,7 +54,7 @@ class Result(Record):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Warnings and advice, the judgement on held-out links, and the reason for the choice of prediction model."""
+        """Warnings, advice, the judgement on held-out links, and the reason for the choice of the prediction model."""
         return wording.remarks(self, "" if self.validation is None else self.validation.choice)
 
     @property

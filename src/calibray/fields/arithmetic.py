@@ -3,9 +3,9 @@
 Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions of
 pairs work element by element and are differentiable.
 
-Segments are the paths of a link, or the interactions of a link with a material. XLA scatters and adds one number at a
-time, which takes about 5 ns. Most numbers can be added in blocks instead: they are ordered so that each block belongs
-to one segment, and only the remainder of each segment is scattered.
+A segment consists of the paths of a link, or the interactions of a link with a material. XLA scatters and adds one
+number at a time, which takes about 5 ns. Most numbers can be added in blocks instead: numbers are ordered so that each
+block belongs to one segment, and only the remainder of each segment is scattered.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SINE: Final = (
     -1.66666666666666324348e-01,
     1.0,
 )
-"""Minimax polynomial for sin(x) / x on [-pi / 4, pi / 4] in powers of x^2, highest first."""
+"""Minimax polynomial for sin(x) / x on [-pi / 4, pi / 4] in powers of x^2, with the highest power first."""
 
 _COSINE: Final = (
     -1.13596475577881948265e-11,
@@ -53,12 +53,12 @@ _COSINE: Final = (
 
 
 def multiply(a: Pair, b: Pair) -> Pair:
-    """Product of two complex numbers, each (real, imaginary) [...]."""
+    """Product of two complex numbers, each given as (real, imaginary) [...]."""
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
 def divide(a: Pair, b: Pair) -> Pair:
-    """Quotient of two complex numbers, each (real, imaginary) [...]."""
+    """Quotient of two complex numbers, each given as (real, imaginary) [...]."""
     inverse = 1 / (b[0] * b[0] + b[1] * b[1])
     return (a[0] * b[0] + a[1] * b[1]) * inverse, (a[1] * b[0] - a[0] * b[1]) * inverse
 
@@ -150,7 +150,7 @@ class Segments:
 
 
 def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
-    """Order numbers by their segments [n] for summation; the order depends on `segment` only."""
+    """Order numbers for summation by their segments [n]; the order depends only on `segment`."""
     size = np.bincount(segment, minlength=count)
     if not (size >= BLOCK).any():
         return Segments(None, jax.device_put(segment.astype(np.int32)), 0, count)

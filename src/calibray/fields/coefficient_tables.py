@@ -3,8 +3,8 @@
 A coefficient depends on the geometry only through the cosine of incidence. If a program has many more interactions than
 its tables have nodes, each candidate's coefficients are computed at the nodes. Cubic polynomials through four nodes
 then interpolate between the nodes, which takes about 10 ns per interaction instead of 100 ns. The position of an
-interaction in its table does not depend on the materials, so it is computed once. Each pair of material and mode has
-its own row of nodes.
+interaction in its table does not depend on the materials, so it is computed once. Each pair of material and mode has a
+separate row of nodes.
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
 very close to grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick slab at
@@ -40,7 +40,8 @@ COARSEST: Final = 16
 """Smallest number of intervals in a row."""
 
 _STAGES: Final = (1024, 8192, FINEST)
-"""Successive limits of the search for a number of intervals; each is tried only if the previous one fails."""
+"""Successive upper limits of the search for a number of intervals; each limit is tried only if the previous one is not
+sufficient."""
 
 _TOLERANCE_SHARE: Final = 0.1
 """Largest permitted error for the representative candidates, as a share of the tolerance."""
@@ -49,7 +50,7 @@ _METAL_LOSS: Final = 1e3
 """Loss term above which a material is treated as a metal."""
 
 _GRAZING: Final = 1e-9
-"""Smallest cosine at a node. At exactly 0, even air would reflect everything."""
+"""Smallest cosine at a node. At exactly 0, even air would be a perfect reflector."""
 
 _EXTRA_NODES: Final = 3
 """Number of nodes minus number of intervals of a row: one node before the first interval, one at the end of the last
@@ -65,7 +66,8 @@ class TableLayout:
     """The position of each coefficient in the tables. The rows of all pairs of material and mode are concatenated.
 
     Attributes:
-        cell: Node below the coefficient, numbered over all rows; one array for each step of each group, [n] or [k, n].
+        cell: Index of the node below the coefficient, counted over all rows; one array for each step of each group, [n]
+            or [k, n].
         fraction: Distance from that node in units of the interval, in arrays of the same shapes.
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
@@ -84,7 +86,7 @@ class TableLayout:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CoefficientTables:
-    """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up reads one or two cache lines.
+    """Tables of coefficients. The numbers of a cell are adjacent in memory, so a look-up reads one or two cache lines.
 
     Attributes:
         values: Coefficients of cubic polynomials in the fraction, from every node to the next [N + 4, 16]. Powers are
@@ -125,7 +127,7 @@ def table_layout(
     intervals: Intervals,
     dtype: type,
 ) -> TableLayout:
-    """Find the position of every coefficient [J] in the tables, for the degrees `root` [M] from `spacing_roots`.
+    """Find the position of every coefficient [J] in the tables. The degrees `root` [M] are from `spacing_roots`.
 
     `steps` are the indices of the coefficients at each step of each group, of any shape; the index J marks an empty
     position, whose coefficient is 1.
@@ -188,8 +190,8 @@ def _cubics(value: jax.Array) -> jax.Array:
 def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array) -> tuple[Pair, Pair]:
     """Transverse electric and magnetic coefficients (real, imaginary) [...], interpolated from the tables.
 
-    `cell` is the node below, numbered over all rows [...], and `fraction` is the distance from it in units of the
-    interval [...].
+    `cell` is the index of the node below, counted over all rows [...], and `fraction` is the distance from this node in
+    units of the interval [...].
     """
 
     def value(part: int) -> jax.Array:
@@ -219,7 +221,7 @@ def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: i
 
 @jax_settings()
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
-    """Number of intervals by material and mode [M, 3] for coefficients with an error within `tolerance` [1].
+    """Number of intervals by material and mode [M, 3] that limits the error of coefficients to `tolerance` [1].
 
     The numbers are powers of two up to `FINEST`; 0 if no coefficient has this material and mode. `tables` [n, M, 8]
     contains the constants of representative candidates.

@@ -1,4 +1,4 @@
-"""Effects that are not properties of a material: they change the antenna fields of a program's paths.
+"""Effects that are not properties of a material; they change the antenna fields of a program's paths.
 
 An effect has its own parameters. All quantities that depend on the fields (path loss, delay spread, derivatives with
 respect to the materials) are evaluated on the changed program.
@@ -63,7 +63,7 @@ def with_antenna_fields(program: GroupedProgram, fields: list[AntennaFields]) ->
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ExtraLoss:
-    """Loss of paths through regions such as woodland; it saturates with the length of the path inside them.
+    """Loss of paths through regions such as woodland; it saturates with the length of the path inside the regions.
 
     Attributes:
         length: Length of every path inside the regions, times the ratio of the specific attenuation at the paths'
@@ -99,8 +99,8 @@ class RoughSurfaces:
     Attributes:
         exponent: 8 (pi / lambda)^2 times the sum of cos^2 theta over the specular reflections of each path on each
             material [P, M], [1/mm^2].
-        fixed: Standard deviation of the surface height of each material, where it is fixed [M], [mm].
-        index: Index of the parameter that is this standard deviation, for each material; None where it is fixed.
+        fixed: Standard deviation of the surface height of each material [M], [mm], if it is fixed.
+        index: For each material, the index of the parameter that is this standard deviation; None if it is fixed.
     """
 
     exponent: jax.Array | NDArray[np.float64]
@@ -155,8 +155,9 @@ class DisplacementLoss:
         """Interpolation error between the five middle knots, for all axes [L], [dB]; 0 for fewer than seven knots.
 
         At each of the three inner knots, the change is compared with the straight line between the two neighbours. The
-        RMS differences of the axes add in quadrature. A step of J dB next to the middle knot gives J / sqrt(6), the RMS
-        error of linear interpolation across a step at any position; a step in an outer interval gives J / sqrt(12).
+        RMS differences of the axes add in quadrature. For a step of J dB next to the middle knot, the result is J /
+        sqrt(6), the RMS error of linear interpolation across a step at any position; for a step in an outer interval,
+        it is J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:

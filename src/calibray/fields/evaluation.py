@@ -2,11 +2,12 @@
 
 With the slab formula, one compiled loop evaluates the candidates of a batch one by one. The data of one candidate
 therefore stay in the core's L1 cache, and a smaller batch takes less time. Within the loop, the stages are materialized
-(`calibray.fields.arithmetic.materialize`), because XLA would otherwise fuse each stage into all its uses on the CPU and
+(`calibray.fields.arithmetic.materialize`). Otherwise, XLA on the CPU would fuse each stage into all of its uses and
 repeat it there.
 
-Large programs with tables are evaluated in stages that are compiled separately. One stage interpolates coefficients,
-propagates the fields and computes the power; it reads every constant once and writes one number per path.
+Large programs with tables are evaluated in stages that are compiled separately. A single stage interpolates
+coefficients, propagates the fields and computes the power, so that it reads every constant once and writes one number
+per path.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ def path_losses(
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
     Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
-    candidate, material and mode [count, M, 3], or zeros without tables. Only the first `count` candidates are
+    candidate, material and mode [count, M, 3]; it is zero without tables. Only the first `count` candidates are
     evaluated. The function is compiled for a batch of n, so that a partly filled batch needs no new compilation.
     """
     count = len(tables) if count is None else count
@@ -170,8 +171,8 @@ def path_losses_and_slopes(
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
     The derivatives are with respect to the material constants in `columns` of the tables. They are 0 for a link without
-    a path. The third result is the largest error of a tabulated coefficient by candidate, material and mode
-    [count, M, 3], or zeros without tables.
+    a path. The third result is the largest error of a tabulated coefficient by candidate, material and mode [count, M,
+    3]; it is zero without tables.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -245,7 +246,7 @@ def _slope(
 ) -> tuple[jax.Array, tuple[GroupResponse, ...]]:
     """Power gain of every link, and its derivative with respect to the response at every step.
 
-    Every path belongs to one link, so one reverse pass over the sum of all powers gives the derivatives for all links.
+    Every path belongs to one link, so one reverse pass over the sum of all powers yields the derivatives for all links.
     """
     power, pull = jax.vjp(lambda responses: _power(program, responses, combining, keep=True), responses)
     (slope,) = pull(jnp.ones_like(power))
@@ -290,7 +291,7 @@ def _contract(
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of path loss [L, M, columns], from those of the power with respect to the response."""
+    """Derivatives of path loss [L, M, columns], from the derivatives of the power with respect to the response."""
     return _loss_slope(power)[:, None, None] * contract(program, slope, derivatives, num_materials)
 
 

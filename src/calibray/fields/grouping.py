@@ -1,8 +1,8 @@
 """Groups of paths that are evaluated together, and the sequence of their interactions.
 
 Paths of a group have interactions of the same kinds in the same order, so that every step of a group is a dense array.
-With padding, paths that differ only in the lengths of their runs of reflections and transmissions share a group, and
-shorter runs are padded with interactions that change nothing.
+With padding, paths that differ only in the lengths of their runs of reflections and transmissions belong to the same
+group, and shorter runs are padded with interactions that have no effect.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ _LETTERS: Final = ("?", COEFFICIENT, SCATTERING, DIFFRACTION)
 _COEFFICIENT_NUMBER: Final = _LETTERS.index(COEFFICIENT)
 
 Step = tuple[str, NDArray[np.int64]]
-"""A letter, and the interactions of a group's n paths: [n], or [k, n] for a run of k, with -1 where a path has none."""
+"""A letter, and the interactions of a group's n paths: [n], or [k, n] for a run of k, with -1 where a path has no
+interaction."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def _numbers(paths: Paths) -> NDArray[np.int64]:
 
 
 def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One number for each path [P], equal for equal sequences of numbers; zeros are skipped."""
+    """One code for each path [P]; codes are equal for equal sequences of numbers, and zeros are skipped."""
     depth, code = np.diff(paths.first), np.zeros(paths.num_paths, dtype=np.int64)
     for step in range(int(depth.max(initial=0))):
         deep = np.flatnonzero(depth > step)

@@ -5,8 +5,8 @@ Outside of Calibray's calls, the user's settings apply.
 Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes.
 A compiled program is machine code, so it is read only from a folder that nobody but the user can write to
 (`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them.
-Calibray uses JAX's keys, which cover everything a program depends on, but reads and writes through its own store. If
-the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder instead.
+Calibray uses JAX's keys, which include everything on which a program depends, but reads and writes entries through its
+own store. If the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder instead.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ def _processor() -> str:
 
 
 WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
-"""Compile for vectors of 512 bits. XLA prefers 256 bits even on processors with wider vectors; on other processors the
-option has no effect. The results are the same."""
+"""Option to compile for vectors of 512 bits. XLA prefers 256 bits even on processors with wider vectors; on other
+processors the option has no effect. The results are the same."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
 """The same options without XLA's emitters of fused loops, for faster compilation. The results differ by rounding

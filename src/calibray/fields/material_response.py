@@ -40,7 +40,8 @@ class MaterialResponse:
 
     Attributes:
         coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
-        co_polarized: Amplitude S sqrt(f_s dOmega (1 - K_x)) of each diffuse interaction in the same polarization [D].
+        co_polarized: Amplitude S sqrt(f_s dOmega (1 - K_x)) of each diffuse interaction in the original polarization
+            [D].
         cross_polarized: Amplitude S sqrt(f_s dOmega K_x) in the orthogonal polarization [D].
     """
 
@@ -122,8 +123,9 @@ def split_by_step(
 ) -> tuple[GroupResponse, ...]:
     """The response, or its derivatives, split into parts for each step of each group.
 
-    Reverse passes differentiate with respect to these parts. Otherwise, each part would need a pass over the complete
-    flat arrays. `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
+    Reverse passes differentiate with respect to these parts. Differentiating with respect to the flat arrays would take
+    one pass over the complete arrays for each part. `blank` is the value of a coefficient at empty positions: 1, or 0
+    for derivatives.
     """
     groups, row = [], 0
     step_coefficients = _coefficients_by_step(program, response, blank)
@@ -202,8 +204,8 @@ def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
 def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
     """F_alpha [D], the integral of a lobe over the half space (eqs. 7 and 8 of the paper), for exponents alpha [M].
 
-    It is interpolated linearly between integer exponents. Above `LARGEST_EXPONENT`, ((1 + cos psi) / 2)^alpha is nearly
-    exp(-alpha psi^2 / 4), and the plane of the surface truncates its tail.
+    The integral is interpolated linearly between integer exponents. Above `LARGEST_EXPONENT`, ((1 + cos psi) / 2)^alpha
+    is nearly exp(-alpha psi^2 / 4), and the plane of the surface truncates its tail.
     """
     low = jnp.clip(jnp.floor(alpha), 1, LARGEST_EXPONENT - 1)
     weight, row = alpha - low, low.astype(jnp.int32)

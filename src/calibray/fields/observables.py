@@ -142,7 +142,7 @@ def link_responses(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Path loss from the sum of powers [count, L], [dB], and statistics [count, K, L]; NaN for a link without a path.
 
-    The first `count` rows of the parameter values [n, d] are evaluated; the function is compiled for n rows.
+    Only the first `count` rows of the parameter values [n, d] are evaluated; the function is compiled for n rows.
     """
     loss, observed = _responses(channel, jax.device_put(values), count)
     return np.asarray(loss)[:count], np.asarray(observed)[:count]
@@ -247,7 +247,7 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
 
 
 def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) -> jax.Array:
-    """Share of every tap's power that the receiver detects, by the level of the tap [T]."""
+    """Detected share of every tap's power [T], as a function of the tap's level."""
     level_db, seen = -decibel(power), jnp.ones_like(power)
     if wanted.dynamic_range_db is not None:
         strongest = jax.ops.segment_max(power, link, num_links)

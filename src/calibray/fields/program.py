@@ -4,7 +4,8 @@ Paths are grouped by the kinds of their interactions (`calibray.fields.grouping`
 The slab formula is evaluated for all groups at once, so its arguments are stored in flat arrays over all groups.
 
 A large program with tables is stored without padding. In other programs, shorter runs of reflections and transmissions
-are padded, so that fewer groups have to be compiled: a small program takes less time to evaluate than to compile.
+are padded, so that fewer groups have to be compiled, because a small program takes less time to evaluate than to
+compile.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Group:
     Attributes:
         tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all are real [1, T, 2, n].
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
-        rotation: Per step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of k.
+        rotation: For each step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of
+            k.
         turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n]; None for other steps.
         wedge: Per step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n]; None for other steps.
         signature: One letter for each step; see `calibray.fields.grouping`.
@@ -77,7 +79,8 @@ class FormulaArguments:
         material: Material [K].
         cosine: Cosine of the angle of incidence [K].
         transmitted: Whether the coefficient is a transmission coefficient [K].
-        unreduced: Whether it is a reflection coefficient not reduced by scattering, as in a diffuse interaction [K].
+        unreduced: Whether the coefficient is a reflection coefficient not reduced by scattering, as in a diffuse
+            interaction [K].
         blank: Whether the position is empty and its coefficient is 1 [K]; None if no position is empty.
         shapes: Shape of the positions at each step of each group, (n,) or (k, n).
         lines: Number of stored positions in each line (one line, or k for a run) of each step; the last line is stored

@@ -16,18 +16,18 @@ FIELD_COLUMN: Final = {name: column for column, name in enumerate(FIELDS)}
 """Column of each material constant in a table of materials."""
 
 _SELECTED_MATERIALS: Final = 12
-"""Number of materials up to which a constant is selected by comparing indices; with more, it is gathered. XLA gathers
-one number at a time, but vectorizes comparisons."""
+"""Largest number of materials for which a constant is selected by comparing indices. With more materials, constants are
+gathered: XLA gathers one number at a time, but vectorizes comparisons."""
 
 
 class Mode(IntEnum):
     """Use of a coefficient."""
 
     REFLECTION = 0
-    """Specular reflection or wedge face; reduced by the scattered energy."""
+    """Coefficient of a specular reflection or a wedge face; reduced by the scattered energy."""
     TRANSMISSION = 1
     FULL_REFLECTION = 2
-    """Reflection in a diffuse interaction; not reduced."""
+    """Reflection coefficient in a diffuse interaction; not reduced."""
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
@@ -44,11 +44,11 @@ def coefficients(
     wavelength: jax.Array,
     transmitted: jax.Array | bool,
 ) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic reflection coefficients, or transmission coefficients where `transmitted` [...].
+    """Transverse electric and magnetic reflection coefficients; transmission coefficients where `transmitted` [...].
 
     The permittivity is relative, `loss` is from `loss_term`, and the thickness is in [m]. Each coefficient is
-    (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double precision: the fourth
-    power of a metal's permittivity exceeds the range of single precision.
+    (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double precision, because the
+    fourth power of a metal's permittivity exceeds the range of single precision.
     """
     precision = cosine.dtype
     cosine, permittivity, loss, thickness, wavelength = (

@@ -32,7 +32,7 @@ STREETS: Final = 12
 
 
 def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
-    """Compute tables that describe the residuals and the certainty of a calibration.
+    """Compute tables that describe the residuals and the uncertainty of a calibration.
 
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean

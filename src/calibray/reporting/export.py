@@ -104,7 +104,7 @@ def export(
 
 
 def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
-    """Load the written scene as a user would, and compare it with the calibrated one."""
+    """Load the written scene as a user would, and compare it with the calibrated scene."""
     # Sionna RT takes seconds to import.
     from calibray.tracing.sionna import Tracer
     from calibray.tracing.sionna.live_scene import verify_export
@@ -116,7 +116,7 @@ def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
 
 
 def _links(result: Record) -> pd.DataFrame:
-    """The links, the nuisance that predictions add to the scene, and the path loss that the script reports [dB]."""
+    """The links, the nuisance that predictions add to the scene's path loss, and the reported path loss [dB]."""
     scene_db, predicted_db = (result.links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
     if result.prediction.model.parameters is None:
         return result.links.assign(nuisance_db=0.0, reported_db=scene_db)

@@ -29,7 +29,7 @@ RASTERIZED: Final = 2000
 """Largest number of points that are drawn as vectors; a larger number is rasterized."""
 
 LONG: Final = 1000
-"""Number of RT calls above which the axis is logarithmic, because the first calls reduce the RMSE most."""
+"""Number of RT calls above which the axis is logarithmic, because the first calls reduce the RMSE the most."""
 
 GROUPS: Final = 24
 """Largest number of groups shown; these are the groups with the most links."""
@@ -64,7 +64,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Draw the best RMSE so far versus RT calls, and, if known, the RMSE of the global optimum [dB]."""
+    """Draw the best RMSE so far versus RT calls and, if known, the RMSE of the global optimum [dB]."""
     figure, axes = style.plain_figure("RT calls", "Best RMSE so far [dB]")
     for method, result in results.items():
         history = result.history
@@ -121,7 +121,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def residual_over_distance(survey: Survey) -> Figure:
-    """Draw the residual of each link versus distance between its antennas."""
+    """Draw the residual of each link versus the distance between its antennas."""
     figure, axes = style.residual_figure("Distance [m]")
     residuals, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     for mask, color, marker, name in (
@@ -143,7 +143,7 @@ def residual_over_distance(survey: Survey) -> Figure:
 
 @style.styled()
 def residual_by_group(survey: Survey) -> Figure:
-    """Draw the residuals of each group: quartiles, median, and whiskers that contain 90 % of the links."""
+    """Draw the residuals of each group: median, quartiles, and whiskers that contain 90 % of the links."""
     frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db})[survey.has_path].dropna()
     sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
     names = sorted(sizes.index[:GROUPS])

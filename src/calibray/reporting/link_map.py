@@ -25,7 +25,7 @@ WIDTH: Final = 1000
 """Width of the map, and its largest height, in map units."""
 
 LEAST_ASPECT: Final = 0.45
-"""Smallest ratio of height to width, so that the map of links along a street is not a thin strip."""
+"""Smallest ratio of height to width; without it, the map of links along a street would be a thin strip."""
 
 MARGIN: Final = 0.12
 """Margin around the links, as a share of their extent."""
@@ -34,7 +34,7 @@ LEAST_EXTENT: Final = 5.0
 """Smallest extent of the map [m]."""
 
 MOST_WALLS: Final = 20_000
-"""Largest number of lines that are drawn for vertical faces, the longest first."""
+"""Largest number of lines that are drawn for vertical faces; the longest lines are drawn first."""
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
 """Colours from negative to positive residuals; colour-blind readers can distinguish the two ends."""
@@ -46,7 +46,7 @@ OUTLINED: Final = 400
 
 @dataclass(frozen=True)
 class Plan:
-    """Layout of the map, which the template draws.
+    """Layout of the map for the template.
 
     Attributes:
         height: Height in map units; the width is `WIDTH`.
@@ -54,7 +54,7 @@ class Plan:
         north: Coordinate of the upper edge [m].
         scale: Map units per metre [1/m].
         buildings: Outlines of buildings, as data of an SVG path.
-        walls: Vertical faces seen from above, also as data of an SVG path.
+        walls: Vertical faces seen from above, in the same form.
         bar: Length of the scale bar [m].
     """
 
@@ -98,7 +98,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
 
 
 def marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """The symbols of links on the map: discs at the ends with more positions, triangles at the opposite ends."""
+    """The symbols of links on the map: discs at the end that has more positions, and triangles at the other end."""
     residuals = links.residual_db
     limit = ramp_limit(residuals)
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
@@ -223,7 +223,7 @@ def save_positions(
 
 @styled()
 def draw_positions(source: str | Path, tx: ArrayLike, rx: ArrayLike) -> Figure:
-    """Draw a plan of the scene with the antennas; arguments as for `save_positions`.
+    """Draw a plan of the scene with the antennas; the arguments are those of `save_positions`.
 
     Raises:
         InputError: The scene cannot be read.

@@ -53,7 +53,7 @@ class Survey:
 
 
 class Quantity(NamedTuple):
-    """The quantity that a study measured.
+    """The quantity that was measured.
 
     Attributes:
         name: Name of the quantity.
@@ -75,7 +75,7 @@ QUANTITIES: Final = {
 
 
 def measured_quantity(result: Record) -> Quantity:
-    """The quantity that the study measured; path loss if the links have no other values."""
+    """The quantity that was measured; path loss if the links have no other values."""
     quantity = result.study.links.quantity
     return QUANTITIES[quantity if _column(result) in result.links else "path_loss"]
 

@@ -48,8 +48,8 @@ WORST: Final = 10
 """Largest number of links in the table of the largest residuals."""
 
 CAPTIONS: Final = {
-    "convergence": "RMSE of the best candidate so far versus RT calls (runs of the ray tracer over all links). It can "
-    "rise if the objective is not the RMSE alone.",
+    "convergence": "RMSE of the best candidate so far versus RT calls (runs of the ray tracer over all links). The "
+    "RMSE can increase if the objective is not the RMSE alone.",
     "cumulative-cost": "RT calls and time versus iterations of the method.",
     "path-loss": "Path loss of every link: measured, and modelled before and after calibration.",
     "residual-over-distance": "Residual (predicted minus measured) versus distance between the antennas.",
@@ -60,8 +60,8 @@ CAPTIONS: Final = {
     "held-out-blocks": "RMSE on each held-out block, by model.",
     "power": "Power by material and type of interaction: share of the links' power on paths that interact with the "
     "material. A path contributes to the share of each of its interactions.",
-    "neighbours": "Semivariance of the residuals versus distance between links (both ends counted). Where it rises, "
-    "neighbouring links share part of their errors.",
+    "neighbours": "Semivariance of the residuals versus distance between links (including both ends). If it increases "
+    "with distance, neighbouring links share part of their errors.",
     "leverage": "Residual versus leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
     "residual contains no information about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
@@ -85,7 +85,7 @@ class PageData:
         links: The links with positions; None if these are unknown.
         scene: The scene; None if it can no longer be read.
         triangles: Meshes of the scene.
-        rays: Paths of the links; None without paths.
+        rays: Paths of the links; None if no link has a path.
         missing: Items that are not shown, with the reasons.
     """
 
@@ -237,7 +237,7 @@ def _asset(name: str) -> str:
 
 
 def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
-    """The key figures at the top of the page: name, value, and lines of comparison."""
+    """The key figures at the top of the page: name, value, and lines with comparisons."""
     model, fit = result.prediction.model, result.fit
     judged = result.holdout_rmse_db is not None
     errors = (

@@ -148,7 +148,7 @@ def remarks(result: Record) -> Table:
 
 
 def nuisances(result: Record) -> Table:
-    """Offsets and the coefficients of further nuisances, by group; no rows if the study declares none."""
+    """Offsets and the coefficients of further nuisances, by group; no rows if the study declares no nuisance."""
     nuisance = result.nuisance
     others = _nuisances_besides_offset(result)
     offsets = {group: f"{value:+z.2f}" for group, value in nuisance.offsets_db.items()}
@@ -177,7 +177,7 @@ def accuracy(result: Record) -> Table:
 
 
 def costs(result: Record) -> Table:
-    """Number of RT calls and replays, and the time taken."""
+    """Numbers of RT calls and replays, and computing times."""
     cost = result.cost
     rows = [("RT calls", f"{cost.rt_calls:,}")]
     if cost.ledger_hits:
@@ -204,7 +204,7 @@ class Value:
 
     Attributes:
         name: Name of the parameter.
-        unit: Unit; empty without one.
+        unit: Unit; empty for a dimensionless parameter.
         before: Value before calibration.
         after: Calibrated value.
         interval: 95 % interval; empty if unknown.

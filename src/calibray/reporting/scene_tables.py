@@ -25,7 +25,7 @@ _HEIGHT_SOURCES: Final = {
 
 
 def contents(scene: MadeScene) -> Table:
-    """The contents of a new scene, and the assumptions made."""
+    """The contents of a new scene, and the assumptions that were made."""
     west, south, bottom, east, north, top = scene.bounds
     rows = [
         ("scene", str(scene.path)),
@@ -180,5 +180,5 @@ def _verdict(change: Convergence, links: int, tolerance_db: float) -> str:
     above = int((np.abs(change.change_db) > tolerance_db).sum())
     return (
         f"Not converged: {above} of {links} links changed by more than {tolerance_db:g} dB "
-        f"(fidelity.tolerance_db); raise trace.samples to {2 * change.samples} or more and check again."
+        f"(fidelity.tolerance_db); increase trace.samples to {2 * change.samples} or more and check again."
     )

@@ -1,4 +1,4 @@
-"""The summary of a report: questions about a calibration, with answers computed from its record."""
+"""The summary of a report: questions about a calibration, and answers computed from its record."""
 
 from __future__ import annotations
 
@@ -179,9 +179,7 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
 def _coverage(count: int, total: int) -> str:
     """Advice about a material that is not identifiable, based on the links with paths that interact with it."""
     if count == 0:
-        return (
-            "no path of any link interacts with it, so these links cannot identify it; measure where paths do"
-        )
+        return "no path of any link interacts with it, so the links cannot identify it; measure links with such paths"
     verb = "has" if count == 1 else "have"
     links = f"{count:,} of {counted(total, 'link')} {verb} paths that interact with it"
     if count < RARE * total:
@@ -210,7 +208,7 @@ def _cautions(result: Record) -> Iterator[Sentence]:
     ]
     if result.nuisance.groups_without_path:
         groups = named(group_text(result, group) for group in result.nuisance.groups_without_path)
-        sentences.append(f"No calibration link of {groups} has a path, so the offset there is unknown.")
+        sentences.append(f"No calibration link of {groups} has a path, so its offset is unknown.")
     yield from _headed("What calls for caution?", sentences, "caution")
 
 
@@ -233,7 +231,7 @@ def _number(value: float) -> str:
 
 
 def _list(names: Sequence[str]) -> str:
-    """Names with "and" before the last one; only the first eight if there are more."""
+    """Names separated by commas, with "and" before the last name; only the first eight if there are more."""
     if len(names) > 8:
         return named(names, 8)
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

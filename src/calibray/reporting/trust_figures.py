@@ -22,7 +22,7 @@ from calibray.tracing.antennas import AntennaPattern, Mounting, Pose, jones_vect
 from calibray.validation.validation import Validation
 
 PARAMETERS: Final = 12
-"""Largest number of parameters that are shown, the least certain first."""
+"""Largest number of parameters that are shown; the least certain parameters are shown first."""
 
 BARS: Final = 36
 """Number of bars in the histogram between a parameter's bounds."""
@@ -31,10 +31,11 @@ ROWS: Final = 14
 """Largest number of rows in the power figure."""
 
 PANELS: Final = 6
-"""Largest number of panels of a figure, one for each observable or each of the transmitters with the most links."""
+"""Largest number of panels of a figure; each panel shows an observable, or one of the transmitters with the most
+links."""
 
 DEEPEST_DB: Final = -30.0
-"""Level of the pattern at the centre of a figure [dB]; sector antennas radiate backwards at about this level."""
+"""Level of the pattern at the centre of a figure [dB]. The back lobe of sector antennas is at about this level."""
 
 
 def trust_figures(result: Record) -> dict[str, Figure]:
@@ -136,7 +137,7 @@ def held_out_blocks(validation: Validation) -> Figure:
 
 
 def _colors(validation: Validation) -> list[tuple[str, str]]:
-    """Models with their colours; calibrated models have the main colours of the page."""
+    """Models with their colours; calibrated models get the main colours of the page."""
     calibrated = iter((style.BLUE, style.ORANGE, style.GREEN))
     others = iter((style.FAINT, *style.PALETTE, *style.PALETTE))
     return [
@@ -199,7 +200,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
 def residuals_by_direction(result: Record) -> Figure | None:
     """Draw the residuals of links versus direction from their transmitter, with its antenna pattern on the horizon.
 
-    None if the study does not state the mounting of transmitters, or its links cannot be read.
+    The result is None if the study does not state the mounting of transmitters, or its links cannot be read.
     """
     study = result.study
     if "tx" not in study.links.mountings:

@@ -28,7 +28,7 @@ INTERACTIONS: Final = 400_000
 """Largest total number of interactions that are shown; if there are more, fewer paths per link are shown."""
 
 TRIANGLES: Final = 250_000
-"""Largest number of triangles that are drawn, the largest first."""
+"""Largest number of triangles that are drawn; the largest triangles are drawn first."""
 
 STEPS: Final = np.iinfo(np.uint16).max
 
@@ -38,7 +38,7 @@ class Rays:
     """Paths to be drawn.
 
     Attributes:
-        paths: The strongest paths of every link, strongest first.
+        paths: The strongest paths of every link, in descending order of power.
         vertex: Interaction points of the paths [I, 3], [m].
         gain_db: Power gain of the paths with the exported materials, without nuisances [P], [dB].
         per_link: Largest number of paths per link.
@@ -119,7 +119,7 @@ class Grid:
 def packed(
     survey: Survey, triangles: Triangles | None, rays: Rays | None, materials: list[str]
 ) -> dict[str, Any]:
-    """Data that the viewer draws; arrays are little-endian integers in base64.
+    """Data for the viewer; arrays are little-endian integers in base64.
 
     `materials` are the materials of the scene, in its order; triangles and rays are None if not available.
     """
@@ -140,7 +140,7 @@ def packed(
 
 
 def _mesh(triangles: Triangles, grid: Grid, materials: list[str]) -> dict[str, Any]:
-    """The triangles, ground first, then by material; vertices on the same grid point are merged."""
+    """The triangles, first those of the ground, then by material; vertices at the same grid point are merged."""
     area = np.linalg.norm(triangles.normal, axis=1)
     kept = np.sort(np.argsort(-area, kind="stable")[:TRIANGLES])
     part = np.where(triangles.ground[kept], 0, 1 + triangles.material[kept])

@@ -59,7 +59,7 @@ def _unused(record: Record) -> str:
 
 
 def carriers_text(record: Record) -> str:
-    """The carriers of the links: the carrier of the scene, unless links have their own."""
+    """The carriers of the links: the carrier of the scene, unless the links state carriers."""
     if "frequency" not in record.links:
         return hertz(record.study.scene.frequency)
     return named(map(hertz, np.unique(record.links["frequency"].to_numpy(float)).tolist()))
@@ -254,10 +254,10 @@ def _obstruction_text(table: pd.DataFrame) -> str:
 
 
 def _missing_region_text(table: pd.DataFrame) -> str:
-    """The region whose extra loss would explain residuals, if it explains more than chance."""
+    """The region whose extra loss would explain the residuals, if it explains more than expected by chance."""
     row = table.iloc[0]
     if not row["significant"]:
-        return "no region of extra loss, such as trees, would explain more of the residuals than chance"
+        return "no region of extra loss, such as trees, would explain more of the residuals than chance does"
     return (
         f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
         f"y = {row['south']:.0f} to {row['north']:.0f} m would explain {percent(float(row['share']))} of the mean "

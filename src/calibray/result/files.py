@@ -46,7 +46,7 @@ from calibray.support.output_files import (
 from calibray.support.strict_models import Section, explain
 
 VERSION: Final = 1
-"""The version of `result.json` that is written and read."""
+"""Version of the format of `result.json`."""
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
 """Files of a result. The prefix distinguishes them from users' own links.csv and scene.xml."""
@@ -71,7 +71,8 @@ OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region
 """Optional numeric columns."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
-"""Columns with only finite values; in other columns, the value of a link without a path can be infinite or empty."""
+"""Columns that contain only finite values; in other columns, the value of a link without a path can be infinite or
+empty."""
 
 
 class LinkCounts(Section):
@@ -175,9 +176,9 @@ def write(
 
 
 def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str, Any]:
-    """Read the fields of a `Record` from a folder that `write` wrote.
+    """Read the fields of a `Record` from a folder written by `write`.
 
-    With `allow_changed_inputs`, files that were edited after they were written are accepted.
+    With `allow_changed_inputs`, files that were edited after the run are accepted.
 
     Raises:
         InputError: The folder contains no result, a result of a different version, a damaged or edited result, or files
@@ -294,7 +295,7 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
 
 
 def check_same_study(study: Study, folder: Path) -> None:
-    """Reject a folder whose result cannot be read or belongs to another study; accept a folder without a result.
+    """Reject a folder with a result that cannot be read or belongs to another study; accept a folder without a result.
 
     Raises:
         InputError: The result cannot be read or belongs to another study.
@@ -366,7 +367,7 @@ def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
-    """Read the held-out errors of a result; None if it was not validated.
+    """Read the held-out errors of a result; None if the result was not validated.
 
     `measured_db` is the measured path loss of the result's links [links], [dB].
 

@@ -31,7 +31,7 @@ class Model(StrEnum):
 
 
 WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
-"""Models that use no paths; the second one uses the walls and roofs of the scene."""
+"""Models that use no paths; the second model uses the walls and roofs of the scene."""
 
 BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models without calibrated materials."""
@@ -82,7 +82,7 @@ class HeldOutErrors:
         labels: Names of the blocks.
         block: Block of every link [links]; -1 if the link is not judged.
         errors: Modelled minus measured path loss by model name [links], [dB]; NaN if the link is not judged.
-        position: Positions of the end that moves [links, 3], [m]; see `moving_end`.
+        position: Positions of the moving end of the links [links, 3], [m]; see `moving_end`.
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
         observables: Errors of the further observables by name; empty in a loaded result, where `Accuracy` contains
@@ -185,7 +185,7 @@ class BlockErrors:
 
 @dataclass(frozen=True)
 class PredictionModel:
-    """A model fitted to the calibration links, and its errors on new links.
+    """A model that is fitted to the calibration links, and its errors on new links.
 
     Attributes:
         name: Name of the model; see `held_out.Model`.
@@ -193,7 +193,7 @@ class PredictionModel:
         terms: Nuisance terms of the model.
         residual_db: RMS of the model's residuals on new links [dB]; None if there are too few links.
         basis: Description of the links on which these residuals were computed.
-        links: Number of these links, or degrees of freedom if they are calibration links.
+        links: Number of these links; if they are calibration links, the degrees of freedom.
         sizes_db: Absolute held-out residuals, ascending [dB]; 400 quantiles if there are more than 400 residuals.
         blocks: Standard deviations of these residuals at two levels; None if too few links were held out.
         averaged: Second set of parameter values, if path loss is the average over two sets; otherwise None.
@@ -215,9 +215,9 @@ class ResidualField:
     """The spatially correlated part of the residuals; see `prediction.corrections`.
 
     Attributes:
-        range_m: Distance at which the correlation has fallen to 1/e [m].
+        range_m: Distance at which the correlation is 1/e [m].
         shared_db: Standard deviation of the correlated part [dB].
-        own_db: Standard deviation of each link's uncorrelated part [dB].
+        own_db: Standard deviation of the uncorrelated part [dB].
     """
 
     range_m: float

@@ -1,4 +1,4 @@
-"""The record of a finished calibration in sections; `calibration.result.Result` adds the methods."""
+"""The record of a finished calibration, divided into sections; `calibration.result.Result` adds the methods."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Fit:
         power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths without
             interaction. The shares can add up to more than 1, because a path contributes to the share of each of its
             interactions.
-        observables: Accuracy for the further observables by name.
+        observables: Accuracy of the calibrated model for the further observables, by name.
     """
 
     parameters: dict[str, float]
@@ -125,7 +125,7 @@ class Uncertainty:
         constants_db: Constants that the scene fixes and that vary in the draws, each with the change in path loss per
             standard deviation of the constant [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
-        undeclared_offset_db: The best-fitting offset if the study declares none [dB]; None if it was not estimated.
+        undeclared_offset_db: Best-fitting offset if the study declares no offset [dB]; None if it was not estimated.
         undeclared_offset_error_db: Standard error of this offset [dB].
         remarks: Warnings and advice.
     """
@@ -181,13 +181,13 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Cost:
-    """Number of RT calls and replays, and the time taken.
+    """Numbers of RT calls and replays, and computing times.
 
     Attributes:
         rt_calls: RT calls of the method, including those found in the ledger.
         ledger_hits: RT calls that were found in the ledger.
         seconds: Time taken by the method, excluding tracing [s].
-        trace_seconds: Time taken by tracing and loading before the search [s].
+        trace_seconds: Time taken to trace and load before the search [s].
         uncertainty_replays: Number of replays for intervals and draws.
         uncertainty_seconds: Time taken to compute intervals and draws [s].
         cheap_replays: Number of replays of the cheap model, which are not RT calls.
@@ -212,7 +212,7 @@ class Provenance:
 
     Attributes:
         files: SHA-256 of every file of the scene and the antennas, by path; empty if unknown.
-        rows: Numbers of rows that were left out, averaged or moved before they became links, by cause.
+        rows: Numbers of rows that were left out, averaged or moved when links were made from them, by cause.
         enclosed: Antennas inside closed bodies of the scene; None if this was not checked.
     """
 

@@ -70,8 +70,8 @@ class Interval:
 
     Attributes:
         standard_error: Standard error from the curvature of the sum of squares at the optimum, in the parameter's unit.
-        lower: Lower end of the 95 % interval, within the bounds; that of the lowest piece if there are several pieces.
-        upper: Upper end of the interval; that of the highest piece if there are several pieces.
+        lower: Lower end of the 95 % interval, within the bounds; with several pieces, that of the lowest piece.
+        upper: Upper end of the interval; with several pieces, that of the highest piece.
         verdict: The verdict on the parameter.
         pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
@@ -98,7 +98,7 @@ class Interval:
         return f"{self.verdict}, approximate" if self.approximate else str(self.verdict)
 
     def contains(self, value: float, slack: float = 0.0) -> bool:
-        """Whether a value lies in one of the pieces, or within the distance `slack` of one."""
+        """Whether a value lies in one of the pieces, or within a distance `slack` of a piece."""
         pieces = self.pieces or ((self.lower, self.upper),)
         return any(low - slack <= value <= high + slack for low, high in pieces)
 
@@ -146,7 +146,7 @@ Value = float | int | bool | str | list[str] | list[float] | list[list[float]]
 
 @dataclass(frozen=True)
 class Remark:
-    """One warning or piece of advice; `RemarkKind` describes its values."""
+    """A warning or a piece of advice; `RemarkKind` describes its values."""
 
     kind: RemarkKind
     values: dict[str, Value] = field(default_factory=dict)

@@ -137,7 +137,7 @@ def remark_text(remark: Remark) -> str:
 def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
     return lambda values: (
         f"{finding} (posterior weight {values['weight']:.2f}, independent Gaussian noise "
-        f"{values['gaussian_weight']:.2f}). The intervals account for it."
+        f"{values['gaussian_weight']:.2f}). The intervals account for this."
     )
 
 
@@ -339,7 +339,7 @@ def _retraced(values: dict[str, Any]) -> str:
         )
     return (
         f"When the scene is traced again with the calibrated values, {', and '.join(changes)}. Values and intervals "
-        "depend on which paths were found: raise trace.samples, if it is a number, or fidelity.rounds."
+        "depend on which paths were found: increase trace.samples, if it is a number, or fidelity.rounds."
     )
 
 
@@ -425,7 +425,7 @@ def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
 
 
 def chosen_model_text(record: Record) -> str:
-    """The held-out accuracy of the prediction model; empty if it is the calibrated one."""
+    """The held-out accuracy of the prediction model; empty if this is the calibrated model."""
     model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
     if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def demo_study_path() -> Path:
-    """The path of the demo's `study.toml`; the folder also contains the scene, the links and the true parameters.
+    """The path of the demo's `study.toml`; its folder also contains the scene, the links and the true parameters.
 
     Example:
         >>> sorted(path.name for path in demo_study_path().parent.iterdir())

@@ -1,9 +1,9 @@
 """State shared by the steps of the window: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
 
-The window uses only the files in the folder that the command line reads and writes.
+The window uses only those files of the folder that the command line also reads and writes.
 
 In 3-D, lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin, because the page's camera
-covers distances of 0.1 to 1000 units.
+shows distances of 0.1 to 1000 units.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class StudyFolder:
 
     @property
     def study_file(self) -> Path:
-        """The study file, which may not exist yet."""
+        """The study file, which might not exist yet."""
         return self.path / STUDY
 
     def files(self, endings: tuple[str, ...]) -> list[str]:
@@ -90,7 +90,7 @@ class StudyFolder:
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:
-        """Names of the folders that contain results, the most recent last."""
+        """Names of the folders that contain results; the most recent is last."""
         written = {
             file.parent.name: file.stat().st_mtime_ns
             for file in self.path.glob("*/result.json")
@@ -139,7 +139,7 @@ class StudyFolder:
         return target
 
     def content(self) -> dict[str, Any]:
-        """The sections of the study file; empty if there is no study file or it is not TOML."""
+        """The sections of the study file; empty if there is no study file, or if it is not valid TOML."""
         try:
             return tomllib.loads(self.study_file.read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
@@ -162,7 +162,7 @@ class StudyFolder:
             return ""
 
     def reasons(self) -> dict[str, str]:
-        """The reasons for drafted settings, from the comments in a draft, by the dotted name of a section or key."""
+        """The reasons for drafted settings, from the study file's comments, by the dotted name of a section or key."""
         from calibray.study.toml_file import reasons_in
 
         return reasons_in(self.text())
@@ -213,7 +213,7 @@ class Solid:
 
 
 def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
-    """The scene of the study, or the chosen scene if there is no study; None if there is neither.
+    """The scene of the study, or the chosen scene if there is no study; None if there is no scene.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -247,7 +247,7 @@ def filled(control: ui.number) -> float:
 
 @dataclass
 class Desk:
-    """The state of the page; there is one user, so all tabs share it.
+    """The state of the page. There is one user, so all tabs use the same state.
 
     Attributes:
         folder: The study's folder.
@@ -277,7 +277,7 @@ class Desk:
         self.jobs = Jobs(self.folder.path)
 
     def start(self, words: Sequence[object]) -> None:
-        """Start a command, and notify the user that it started or why it did not."""
+        """Start a command, and notify the user of its start or of the reason for a failure."""
         with self.messages():
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")
@@ -328,7 +328,8 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     """The map of the study, or of a scene in the folder if there is no study.
 
     The map contains `west`, `north` [m] and `scale` [1/m] of the outlines; `buildings` and `walls` as SVG path data;
-    `links`, each with x, y [m], path loss [dB] and 1 if suspicious, else 0; `transmitters`, x, y, z [m]; and `sites`.
+    `links`, each with x, y [m], path loss [dB], and 1 if it is suspicious, otherwise 0; `transmitters`, x, y, z [m];
+    and `sites`.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -410,7 +411,7 @@ def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
 def grid_above_ground(
     folder: StudyFolder, scene: str | None, x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> NDArray[np.float64]:
-    """Points [n, 3], [m], of a grid with ascending, equally spaced x and y [m], at a height above the ground.
+    """Points [n, 3], [m], at a height above the ground, of a grid with ascending, equally spaced x and y [m].
 
     Raises:
         InputError: There is no scene, or it cannot be read.
@@ -425,7 +426,7 @@ def grid_above_ground(
 
 
 def findings(folder: StudyFolder) -> list[str]:
-    """Warnings about suspicious links of a study, as sentences; none without a study.
+    """Warnings about suspicious links of a study, as sentences; empty without a study.
 
     Raises:
         InputError: The scene or the links cannot be read.

@@ -1,8 +1,8 @@
 """Commands that were started in a study's folder by the window or from a terminal.
 
 Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes it,
-`0001.log` contains its output, and `0001.exit` its exit status. A command with neither an exit status nor a process has
-died; starting it again resumes its work.
+`0001.log` contains its output, and `0001.exit` contains its exit status. A command without an exit status and without a
+process has died; starting it again resumes its work.
 
 `python -m calibray.window.jobs` runs one command in its own session, so that it outlives the server, and records its
 exit status. Ctrl-C is passed to the command, which keeps finished work.
@@ -110,7 +110,7 @@ class Jobs:
         return Job(number, tuple(words), "running", child.pid)
 
     def list(self) -> list[Job]:
-        """The commands started in the folder, the most recent first."""
+        """The commands started in the folder; the most recent is first."""
         files = sorted(self._folder.glob("[0-9]*.json"), reverse=True)
         return [job for job in map(_read, files) if job is not None]
 

@@ -197,7 +197,7 @@ def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
 
 
 def _progress(job: Job) -> None:
-    """Draw the stages of a running command: earlier ones, the progress of the last one, and the best value so far."""
+    """Draw the stages of a running command: earlier stages, progress of the last stage, and the best value so far."""
     shown = stages(job.log)
     for stage in shown[:-1]:
         ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.best)))).classes("quiet")

@@ -229,7 +229,7 @@ def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changes(studies: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Settings that differ between studies: the value in each study, None where it is missing, by dotted name."""
+    """Settings that differ between studies, by dotted name: the value in each study, or None where it is missing."""
     tables = [settings(study) for study in studies]
     rows = {name: [table.get(name) for table in tables] for table in tables for name in table}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
@@ -389,7 +389,7 @@ def write_links(
 
 
 def _grid(desk: Desk, cell: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Eastings and northings [m] of a regular grid in the chosen area."""
+    """The x and y coordinates [m] of a regular grid in the chosen area."""
     if desk.area is None:
         raise InputError("draw an area on the map first; its grid cells are the candidates")
     west, south, east, north = desk.area

@@ -189,7 +189,7 @@ def show_measurements(desk: Desk) -> None:
 
 @ui.refreshable
 def findings(desk: Desk) -> None:
-    """Draw the warnings about suspicious links, which are orange on the map."""
+    """Draw the warnings about suspicious links; these links are orange on the map."""
     for finding in desk.findings:
         ui.label(finding).classes("warning").props("role=note")
 
@@ -379,5 +379,5 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
 
 
 def safe(name: str) -> str:
-    """A name without quotes, which would end a property string."""
+    """A name without quotes, because a quote would end a property string."""
     return "".join(letter for letter in name if letter.isalnum() or letter in " ._-")

@@ -1,4 +1,4 @@
-"""Load the calibrated scene in plain Sionna RT, and compare its path loss with the reported one, link by link.
+"""Load the calibrated scene in Sionna RT without Calibray, and compare its path loss with the reported one.
 
 Usage: python load_scene.py [ROW ...]
 
