@@ -412,7 +412,9 @@ def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = Fals
         case ".csv" | ".parquet":
             write_table(target, frame)
         case ".json":
-            write_text(target, json.dumps({name: frame[name].tolist() for name in frame}) + "\n")
+            # JSON has no infinity.
+            finite = frame.replace(-np.inf, POWER_ZERO_DB)
+            write_text(target, json.dumps({name: finite[name].tolist() for name in finite}) + "\n")
         case ".h5" | ".hdf5":
             with replacing(target) as partial, h5py.File(partial, "w") as content:
                 for name in frame:
