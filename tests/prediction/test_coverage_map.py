@@ -285,6 +285,7 @@ def test_the_group_is_that_of_the_links_measured_at_the_transmitter(result, monk
         ({"bounds": [10, 0, -10, 5]}, "west less than east"),
         ({"height": np.nan}, "height = nan"),
         ({"height": None}, "height = None: must be a finite number"),
+        ({"height": -1.0}, "height = -1: must be a finite number greater than 0"),
         ({"cell": "5"}, "cell = '5': must be a finite number greater than 0"),
         ({"tx": "mast"}, "tx = 'mast': must be x, y and z"),
         ({"bounds": "scene"}, "bounds = 'scene': must be west, south, east and north"),

@@ -90,7 +90,7 @@ def coverage_map(
     study = result.study
     transmitter = _transmitter(result, tx)
     constants = _column_values(result, transmitter, columns or {})
-    _check_number("height", height, -np.inf)
+    _check_number("height", height, 0.0)
     _check_number("cell", cell, 0.0)
     if power_dbm is None and study.links.quantity == "rsrp":
         power_dbm = 0.0
