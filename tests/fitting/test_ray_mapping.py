@@ -26,6 +26,7 @@ from calibray.optimizers.evaluations import Best
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import spherical_basis
+from calibray.result.wording import remark_text
 from calibray.study import Setup
 from calibray.tracing.settings import Antenna
 
@@ -415,3 +416,20 @@ def test_a_link_that_the_replay_lacks_is_lost(foreign: Foreign, monkeypatch: pyt
     assert mapped.gap_db < 0.05
     assert mapped.lost == 1
     assert not mapped.reached
+
+
+def test_paths_without_a_calibrated_material_do_not_show_that_the_model_represents_the_engine(
+    foreign: Foreign,
+) -> None:
+    """Any model explains ratios that are 1."""
+    direct = np.flatnonzero(np.diff(foreign.paths.first) == 0)
+
+    def ask(candidate: np.ndarray) -> Export:
+        return Export.of_table(foreign.rays(candidate).take(direct), RaySetting.of(foreign.problem.setup))
+
+    mapped = map_rays(foreign.problem, ask, most_calls=3)
+    assert mapped.understanding.misfit_db < 1e-6
+    assert mapped.reached
+    assert not mapped.understood
+    text = remark_text(ray_mapping._remark(mapped))
+    assert text.startswith("No path of the program meets a calibrated material")

@@ -124,9 +124,11 @@ class RayMap:
     def understood(self) -> bool:
         """Whether the optimum is reached, the model explains all calls, and the calls share their strong paths.
 
-        Its replay then represents the engine at other candidates as well.
+        Its replay then represents the engine at other candidates as well. Ratios of paths without a calibrated material
+        are 1 with any model, so they explain nothing.
         """
-        explained = self.understanding.misfit_db <= MISFIT_DB
+        model = self.understanding.model
+        explained = model.meets_calibrated and self.understanding.misfit_db <= MISFIT_DB
         return self.reached and explained and self.changed_db <= CHANGED_DB
 
 
@@ -326,6 +328,7 @@ def _remark(mapped: RayMap) -> Remark:
             **{name: value for name, value in levels.items() if np.isfinite(value)},
             "understood": mapped.understood,
             "reached": mapped.reached,
+            "meets_calibrated": model.meets_calibrated,
             "calls": len(mapped.calls),
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,

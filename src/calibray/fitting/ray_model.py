@@ -112,6 +112,12 @@ class RayModel:
         )
 
     @cached_property
+    def meets_calibrated(self) -> bool:
+        """Whether any path meets a material with a parameter; otherwise no ratio of powers differs from 1."""
+        met = {list(self.paths.materials)[index] for index in np.unique(self.paths.material)}
+        return any(item.material in met for item in self.parameters)
+
+    @cached_property
     def start(self) -> NDArray[np.float64]:
         """The study's constants, and upright vertical polarization."""
         constants = [np.log(getattr(self.paths.materials[name], field)) for name, field in self.assumed]

@@ -268,6 +268,12 @@ def _ray_mapping(values: dict[str, Any]) -> str:
             "with a path, in common. The optimum may be missed, and intervals are approximate. Check why the program's "
             "paths appear or disappear when the materials change, or choose a method that requires no rays."
         )
+    # Records of earlier versions lack this value.
+    if not values.get("meets_calibrated", True):
+        return (
+            f"No path of the program meets a calibrated material, so its {values['calls']} calls show neither these "
+            "materials nor whether the model represents the program. Calibrate materials on the paths, or check them."
+        )
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
     surfaces = "half-spaces" if values["half_space"] else "slabs"
