@@ -263,7 +263,8 @@ def differing_groups(
 
 
 SHARE: Final = 0.02
-"""Smallest share of links without a path for which other tracer settings are tried; fewer hardly change the fit."""
+"""Smallest share of links without a path for which other tracer settings are tried; a smaller share hardly changes the
+fit."""
 
 FEWEST: Final = 5
 """Smallest number of links without a path for which other tracer settings are tried."""

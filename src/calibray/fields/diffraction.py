@@ -60,7 +60,7 @@ def transition(x: NDArray[np.float64]) -> NDArray[np.complex128]:
 def _cotangent_times_transition(
     psi: NDArray[np.float64], x: NDArray[np.float64], n: NDArray[np.float64], size: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
-    """cot(psi) F(x); its finite limit on shadow and reflection boundaries, where a pole coincides with a zero of F."""
+    """cot(psi) F(x), or its finite limit on shadow and reflection boundaries, where a pole meets a zero of F."""
     sine = np.sin(psi)
     pole = np.abs(sine) < 1e-9
     limit = np.where(sine >= 0, 1.0, -1.0) * n * np.sqrt(2 * np.pi * size) * np.exp(0.25j * np.pi)

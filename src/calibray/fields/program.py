@@ -52,7 +52,8 @@ class Group:
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: For each step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of
             k.
-        turn: Per step, (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n]; None for other steps.
+        turn: For each diffuse step, (cos, sin) of the rotation from the frame of incidence into the basis (theta, phi)
+            [2, n]; None for other steps.
         wedge: Per step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n]; None for other steps.
         signature: One letter for each step; see `calibray.fields.grouping`.
         size: Number of paths n.
@@ -108,9 +109,9 @@ class DiffuseArguments:
         solid_angle: Solid angle of the ray tube, divided by its sampling probability [D], [sr].
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
-        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty as `cos_incidence`.
-        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty as
-            `cos_incidence`.
+        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty in the same case.
+        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty in
+            the same case.
         patterns: Scattering pattern of every material.
     """
 

@@ -44,7 +44,7 @@ def coefficients(
     wavelength: jax.Array,
     transmitted: jax.Array | bool,
 ) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic reflection coefficients; transmission coefficients where `transmitted` [...].
+    """Transverse electric and magnetic reflection coefficients; transmission coefficients where `transmitted` is true.
 
     The permittivity is relative, `loss` is from `loss_term`, and the thickness is in [m]. Each coefficient is
     (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double precision, because the

@@ -1,4 +1,4 @@
-"""Export of the calibrated scene for plain Sionna RT, and of its materials as tables for other tools."""
+"""Export of the calibrated scene for Sionna RT without Calibray, and of its materials as tables for other tools."""
 
 from __future__ import annotations
 

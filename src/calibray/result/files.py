@@ -286,7 +286,7 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
     offset = {"offset"} if study.offset is not None else set()
     if set(nuisance.coefficients) != set(study.nuisance) | offset:
         raise InputError(
-            f"{source}: nuisance.coefficients: must have the terms of the study; run the study again"
+            f"{source}: nuisance.coefficients: must contain the terms of the study; run the study again"
         )
     if excessive := [value for value in nuisance.offsets_db.values() if abs(value) > 500]:
         raise InputError(

@@ -410,8 +410,8 @@ def judgement_text(judgement: Judgement) -> str:
 def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
     """The model chosen on held-out blocks, and the reason for the choice.
 
-    `best` has the lowest RMSE there among the models that can predict any link. `partner` is the model with which the
-    chosen model is averaged.
+    `best` has the lowest RMSE on these blocks among the models that can predict any link. `partner` is the model with
+    which the chosen model is averaged.
     """
     if partner is None:
         used, preferred = f"The chosen model is {str(chosen)!r}", ""
