@@ -353,7 +353,7 @@ def test_a_logarithmic_parameter_is_searched_by_its_logarithm():
     ("method", "message"),
     [
         ("sgwoim", "method 'sgwoim': there is no such method; did you mean 'sgwo-im'"),
-        ("zzz", "there are: auto"),
+        ("zzz", "use one of: auto"),
     ],
 )
 def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, message):

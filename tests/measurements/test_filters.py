@@ -134,7 +134,7 @@ def test_anything_else_is_refused_without_side_effects(expression, tmp_path, mon
 @pytest.mark.parametrize(
     ("expression", "piece", "remedy"),
     [
-        ("x > 1 and x.to_csv('f')", "to_csv() is not allowed", "there are: abs, between"),
+        ("x > 1 and x.to_csv('f')", "to_csv() is not allowed", "use one of: abs, between"),
         ("x.isin([(x.to_csv)('f')])", "(x.to_csv)('f'): must be", "a number, a text"),
         ("x > 7**7**7**7", "7**7**7: the result is too large", "correct it"),
         ("x > 1 and sett == 'LOS'", "no column 'sett'", "did you mean 'set'"),

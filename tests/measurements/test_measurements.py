@@ -295,7 +295,7 @@ LATER = TABLE.splitlines()[1:]
         (TABLE.replace("spread", "loss"), {}, "row 1: column 'loss' appears twice"),
         # Columns
         (TABLE, {"value": "los"}, "no column 'los'; did you mean 'loss'"),
-        (TABLE, {"rx": ["x", "y", "hight"]}, "no column 'hight'; there are: x, y, z, loss"),
+        (TABLE, {"rx": ["x", "y", "hight"]}, "no column 'hight'; use one of: x, y, z, loss"),
         (TABLE, {"group": "sets"}, "no column 'sets'; did you mean 'set'"),
         (TABLE, {"weight": "wait"}, "no column 'wait'"),
         (TABLE, {"rx": ["x", "y"]}, r"rx = \['x', 'y'\]: must be x, y and z"),

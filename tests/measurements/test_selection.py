@@ -48,7 +48,7 @@ def test_links_get_the_columns_of_their_transmitters():
     assert joined["x"].tolist() == [7.0, 8.0, 9.0]
     assert joined["transmitter_x"].tolist() == [1.0, 5.0, 1.0]
     for rows, message in (
-        (sites.iloc[1:], "log.csv: sites.csv lacks 'two', the transmitter of 1 of 3 rows; there are: one"),
+        (sites.iloc[1:], "log.csv: sites.csv lacks 'two', the transmitter of 1 of 3 rows; use one of: one"),
         (sites.iloc[:0], r"'one', 'two', .*where = \"`transmitter` not in \['one', 'two'\]\""),
         (pd.concat([sites, sites]), "sites.csv: one of two, one, two, one appears twice"),
         (sites.drop(columns="transmitter"), "sites.csv: no column 'transmitter'"),

@@ -111,7 +111,7 @@ def test_a_gap_between_two_ranges_is_refused_with_both_ranges_and_a_remedy():
     ("arguments", "message"),
     [
         (("concret", 4e9), "did you mean 'concrete'"),
-        (("unobtainium", 4e9), "there are: vacuum, concrete"),
+        (("unobtainium", 4e9), "use one of: vacuum, concrete"),
         (("asphalt_concrete", 4e9), "it is in P.2040-4"),
         (("concrete", 4e9, 0.1, "P.2040-9"), "revision = 'P.2040-9'"),
         (("concrete", nan), "frequency = nan"),

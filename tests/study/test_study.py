@@ -404,11 +404,11 @@ def test_settings_of_methods_are_read(folder, method, options):
 @pytest.mark.parametrize(
     ("method", "options", "message"),
     [
-        ("gwo", "{ wolves = 3 }", "wolves: the method 'gwo' has no such setting; there are: "),
+        ("gwo", "{ wolves = 3 }", "wolves: the method 'gwo' has no such setting; use one of: "),
         ("gwo", "{ populatoin = 3 }", "the method 'gwo' has no such setting; did you mean 'population'?"),
         ("gwo", "{ seed = 3 }", "seed: the method 'gwo' has no such setting"),
         ("gwo", "{ lower = [3] }", "lower: the method 'gwo' has no such setting"),
-        ("space-mapping", "{ cheap_model = 3 }", "there are: budget, batch, noisy"),
+        ("space-mapping", "{ cheap_model = 3 }", "use one of: budget, batch, noisy"),
         ("sgwo-im", "{ surrogate = 'x' }", "surrogate = 'x': must be true or false"),
         ("sgwo-im", "{ surrogate = 1 }", "surrogate = 1: must be true or false"),
         ("gwo", "{ population = '9' }", "population = '9': must be a whole number"),

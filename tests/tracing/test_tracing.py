@@ -351,7 +351,7 @@ def test_invalid_positions_are_refused(house: Tracer, tx: list, rx: list, messag
         ({"rx_antenna": {"orientation": 0.3}}, r"antenna orientation = 0\.3: must be three angles"),
         (
             {"materials": {"bricks": {"thickness": 0.3}}},
-            r"no material 'bricks'; did you mean 'stone'|there are: stone",
+            r"no material 'bricks'; did you mean 'stone'|use one of: stone",
         ),
     ],
 )
@@ -362,7 +362,7 @@ def test_invalid_options_are_refused(house: Tracer, options: dict, message: str)
 
 
 def test_a_material_that_the_scene_lacks_is_refused(house: Tracer) -> None:
-    with pytest.raises(InputError, match="the scene has no material 'glass'; there are: stone"):
+    with pytest.raises(InputError, match="the scene has no material 'glass'; use one of: stone"):
         house.trace(links([-20, 0, 3], [[-10, 3, 2]]), materials={"glass": cb.Material(6.0, 0.0, 0.01)})
 
 

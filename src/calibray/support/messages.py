@@ -23,7 +23,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         >>> did_you_mean("concret", ["brick", "concrete"])
         "did you mean 'concrete'?"
         >>> did_you_mean("marble", ["brick", "concrete"])
-        'there are: brick, concrete'
+        'use one of: brick, concrete'
     """
     names = [str(known_name) for known_name in known]
     compared = [known_name for known_name in islice(names, MAX_COMPARED) if len(known_name) <= MAX_LENGTH]
@@ -32,7 +32,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     if not names:
         return "there are none"
     more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
-    return f"there are: {', '.join(shortened(known_name) for known_name in names[:MAX_LISTED])}{more}"
+    return f"use one of: {', '.join(shortened(known_name) for known_name in names[:MAX_LISTED])}{more}"
 
 
 def shortened(text: str, longest: int = MAX_LENGTH) -> str:
