@@ -381,7 +381,7 @@ def test_the_summary_says_which_parameters_are_identified(result):
     turned = changed(result, intervals={"tx:S1.azimuth": pose, "region:trees.specific_attenuation": pose})
     assert not any("interact" in part.text for counts in (None, {}) for part in summary(turned, counts))
     without_intervals = changed(result, intervals={})
-    assert "gives no derivatives" in answer(without_intervals, "How certain are the values?")
+    assert "provides no derivatives" in answer(without_intervals, "How certain are the values?")
 
 
 def test_bars_show_values_and_intervals_at_their_positions(result):

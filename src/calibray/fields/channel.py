@@ -141,7 +141,7 @@ def power_delay_profile(
     edges = np.asarray(delays, dtype=float)
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise InputError(
-            f"delays: an array of shape {edges.shape}; must be two or more increasing bin edges [s]"
+            f"delays: is an array of shape {edges.shape}, must be two or more increasing bin edges [s]"
         )
     program = layout(paths).program
     power = path_powers(program, paths.material_table(materials))

@@ -7,8 +7,8 @@ interaction in its table does not depend on the materials, so it is computed onc
 separate row of nodes.
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
-very close to grazing incidence. A sheet of plasterboard at 2 GHz needs about a hundred intervals, and a thick slab at
-60 GHz needs thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
+very close to grazing incidence. A sheet of plasterboard at 2 GHz requires about a hundred intervals, and a thick slab
+at 60 GHz requires thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
 `table_error` then bounds every candidate's error, even at Brewster angles, grazing incidence and slab resonances.
 """
 

@@ -1,7 +1,7 @@
 """Response of the materials: the coefficients of all interactions, and the amplitudes of diffuse reflection.
 
-`material_response` computes them for all groups together, in flat arrays or as tables. `split_by_step` splits them into
-parts for each step of each group.
+`material_response` computes the response for all groups together, in flat arrays or as tables. `split_by_step` splits
+the response into parts for each step of each group.
 
 The scattering patterns f_s of diffuse reflection follow Degli-Esposti et al., IEEE Trans. Antennas Propag. 55(1), 2007.
 """

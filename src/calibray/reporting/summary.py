@@ -25,7 +25,8 @@ from calibray.validation.validation import Validation
 Kind = Literal["plain", "good", "caution"]
 
 RARE: Final = 0.05
-"""If a smaller share of the links has paths that interact with a material, the advice is to measure more such links."""
+"""Share of links with paths that interact with a material; below this share, the advice is to measure more such links.
+"""
 
 LISTED_VALUES: Final = 6
 """Largest number of identified values that are listed."""
@@ -120,7 +121,7 @@ def _certainty(result: Record) -> Iterator[Sentence]:
     if not result.intervals:
         yield Sentence(
             heading,
-            f"Unknown: the engine {result.study.engine.name} gives no derivatives, so there are no intervals. "
+            f"Unknown: the engine {result.study.engine.name} provides no derivatives, so there are no intervals. "
             "The values fit best among those that were tried; the true values can be very different.",
             "caution",
         )

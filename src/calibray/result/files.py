@@ -1,4 +1,4 @@
-"""Writing, reading and validation of the files of a result; each file is written completely or not at all."""
+"""Write, read and validate the files of a result; each file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ VERSION: Final = 1
 """Version of the format of `result.json`."""
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
-"""Files of a result. The prefix distinguishes them from users' own links.csv and scene.xml."""
+"""Files of a result. The prefix distinguishes them from a user's own links.csv and scene.xml."""
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)

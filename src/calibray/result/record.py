@@ -44,7 +44,7 @@ class ObservableFit:
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
         mean_rmse: RMSE of a baseline that predicts the mean value for every link.
-        error: Standard deviation of the error of a value, stated or estimated.
+        error: Standard deviation of the error of a measured value, stated or estimated.
         biases: Bias by group; the group "" contains all links.
         bias_errors: Standard error of each bias, including the uncertainty of the parameters.
     """

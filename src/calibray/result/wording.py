@@ -209,8 +209,8 @@ def _outside_interval(values: dict[str, Any]) -> str:
 def _approximate_intervals(values: dict[str, Any]) -> str:
     replay = ", combined with the corrected replay of its scene" if values["replay"] else ""
     return (
-        f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
-        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, its RMS error is "
+        f"The intervals are approximate: the engine {values['engine']!r} provides no derivatives, so an emulator was "
+        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, the emulator's RMS error is "
         f"{values['error_db']:.2g} dB at calls whose RMSE is below the median."
     )
 

@@ -1,4 +1,4 @@
-"""The server of the window. Only this machine can reach it, and a guard refuses unauthorized requests."""
+"""The server of the window; only this machine can reach it, and a guard refuses unauthorized requests."""
 
 from __future__ import annotations
 
