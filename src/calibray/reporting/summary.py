@@ -25,8 +25,7 @@ from calibray.validation.validation import Validation
 Kind = Literal["plain", "good", "caution"]
 
 RARE: Final = 0.05
-"""Share of links with paths that interact with a material; below this share, the advice is to measure more such links.
-"""
+"""Share of links with paths that interact with a material; below it, the advice is to measure more such links."""
 
 LISTED_VALUES: Final = 6
 """Largest number of identified values that are listed."""

@@ -234,11 +234,12 @@ class Record:
         prediction: The model that predictions use.
         cost: RT calls, replays and time.
         provenance: The inputs of the calibration.
-        links: One row per link: row in the source file; path loss [dB] as measured, before and after calibration, by
-            the log-distance model, by the prediction model (by the fallback for links without a path), and by the scene
-            of the prediction model alone; has_path; held_out; change in path loss when traced again [dB]; positions
-            tx_x to rx_z [m]. If applicable: group, frequency [Hz], path loss with the nuisances alone [dB], values in
-            the measured quantity, leverage, depth, and whether the link is censored or near the noise floor.
+        links: One row per link, with its row in the source file, has_path, held_out, and the positions tx_x to rx_z
+            [m]. Path loss [dB] is listed as measured, before and after calibration, by the log-distance model, by the
+            prediction model (by the fallback for links without a path), and by the scene of the prediction model alone.
+            Another column contains the change in path loss when traced again [dB]. If applicable, further columns are
+            group, frequency [Hz], path loss with the nuisances alone [dB], values in the measured quantity, leverage,
+            depth, and whether the link is censored or near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
         scene: The scene as it was read; None in a loaded result.
