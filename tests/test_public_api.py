@@ -52,7 +52,7 @@ RESULT_METHODS = {
     "suggest": "self, candidates, count, progress, allow_changed_inputs, observables",
     "report": "self, file, overwrite, progress",
     "apply": "self, scene",
-    "export": "self, folder, copy, overwrite",
+    "export": "self, folder, copy, overwrite, allow_changed_inputs",
 }
 
 

@@ -26,6 +26,7 @@ from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.reporting.export import FILES, _rows, export, matlab
+from calibray.reporting.page import collect
 from calibray.reporting.wording import sampling_text
 from calibray.scenes import export_scene, read_scene
 from calibray.tracing.protocol import LinkPositions
@@ -115,6 +116,17 @@ def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_mat
     assert sampling_text(result) == ""
     unchecked = replace(result, fit=replace(result.fit, retrace_gap_db=None))
     assert "depends on the materials" in sampling_text(unchecked)
+
+
+def test_a_scene_that_changed_since_the_calibration_is_not_exported_or_shown(folder, tmp_path):
+    result = Result.load(folder / "out")
+    other = changed(result, files={name: "0" * 64 for name in result.provenance.files})
+    with pytest.raises(InputError, match=r"changed since the calibration, so the export would not be"):
+        export(other, tmp_path / "exported")
+    assert not (tmp_path / "exported").exists()
+    assert export(other, tmp_path / "exported", allow_changed_inputs=True) == FILES
+    (missing,) = [text for text in collect(other).missing if text.startswith("Paths")]
+    assert "changed since the calibration" in missing
 
 
 def test_tables_hold_the_calibrated_constants_and_intervals(folder, tmp_path):

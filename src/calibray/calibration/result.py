@@ -197,8 +197,15 @@ class Result(Record):
 
         apply_materials(scene, self.materials, self.study.scene.frequency)
 
-    def export(self, folder: str | Path, *, copy: bool = False, overwrite: bool = False) -> tuple[str, ...]:
+    def export(
+        self,
+        folder: str | Path,
+        *,
+        copy: bool = False,
+        overwrite: bool = False,
+        allow_changed_inputs: bool = False,
+    ) -> tuple[str, ...]:
         """Write the calibrated scene for Sionna RT, and its materials as tables; see `calibray.reporting.export`."""
         from calibray.reporting.export import export
 
-        return export(self, folder, copy, overwrite)
+        return export(self, folder, copy, overwrite, allow_changed_inputs=allow_changed_inputs)

@@ -323,7 +323,9 @@ def export(
     from calibray.reporting.wording import sampling_text, scene_alone_text
 
     result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
-    names = write(result, out, copy, permissions.overwrite)
+    names = write(
+        result, out, copy, permissions.overwrite, allow_changed_inputs=permissions.allow_changed_inputs
+    )
     for note in filter(None, (scene_alone_text(result), sampling_text(result))):
         echo(f"Note: {note}", err=True)
     echo(f"Written to {out}: {', '.join(names)}", err=True)

@@ -96,7 +96,7 @@ def _check_same_inputs(setup: Setup, folder: Path) -> None:
     from calibray.prediction.predict import changed_files, has_links
 
     result = Result.load(folder, allow_changed_inputs=True)
-    changed = changed_files(result, setup)
+    changed = changed_files(result, setup.files)
     if not has_links(result, setup.links):
         changed = [*changed, str(setup.links.source)]
     if changed:

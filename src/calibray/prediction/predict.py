@@ -434,21 +434,24 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
     Raises:
         InputError: A file has changed.
     """
-    if not allow_changed and (changed := changed_files(result, setup)):
+    if not allow_changed and (changed := changed_files(result, setup.files)):
         raise InputError(
             f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may be invalid for "
             "the changed file; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
         )
 
 
-def changed_files(result: Record, setup: Setup) -> list[str]:
-    """Names of the files of the scene and antennas that have changed since the calibration."""
+def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
+    """Names of the files of the scene and antennas that have changed since the calibration.
+
+    `files` are the current files with their digests, as `Setup.files`.
+    """
     if not result.provenance.files:
         return []
     # Files are compared by name and content, because the whole folder may have moved.
     calibrated, current = (
         sorted((Path(file).name, digest) for file, digest in files.items())
-        for files in (result.provenance.files, setup.files)
+        for files in (result.provenance.files, files)
     )
     return sorted({name for name, _ in set(calibrated) ^ set(current)})
 

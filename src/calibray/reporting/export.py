@@ -16,11 +16,13 @@ import pandas as pd
 from calibray.errors import InputError
 from calibray.materials import FIELDS
 from calibray.measurements import position_columns
+from calibray.prediction.predict import changed_files
 from calibray.reporting.link_survey import Survey, survey
 from calibray.reporting.wording import scene_alone_text
 from calibray.result.record import Record
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.scenes.scene import exported_names
+from calibray.study.setup import input_digests
 from calibray.support.messages import printable
 from calibray.support.output_files import check_outputs, csv_text, write_text
 from calibray.tracing.protocol import LinkPositions
@@ -49,7 +51,12 @@ end
 
 
 def export(
-    result: Record, folder: str | Path, copy_meshes: bool = False, overwrite: bool = False
+    result: Record,
+    folder: str | Path,
+    copy_meshes: bool = False,
+    overwrite: bool = False,
+    *,
+    allow_changed_inputs: bool = False,
 ) -> tuple[str, ...]:
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables.
 
@@ -58,6 +65,7 @@ def export(
         folder: Folder to write into; created if needed.
         copy_meshes: Copy the meshes into the folder; otherwise, the scene refers to the original files.
         overwrite: Also replace files that Calibray did not write.
+        allow_changed_inputs: Export even if a file of the scene or an antenna has changed since the calibration.
 
     Returns:
         Names of the files in the folder. `wording.scene_alone_text` states the difference between the scene alone and
@@ -65,13 +73,18 @@ def export(
 
     Raises:
         InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links can no
-            longer be read, or Sionna RT loads a scene that differs from the calibrated one.
+            longer be read, the scene has changed, or Sionna RT loads a scene that differs from the calibrated one.
     """
     study = result.study
     target = check_outputs(folder, FILES, study.files(), overwrite)
     scene = result.scene or read_scene(
         study.scene_source, study.scene.frequency, study.overrides, study.objects
     )
+    if not allow_changed_inputs and (changed := changed_files(result, input_digests(study, scene))):
+        raise InputError(
+            f"{study.path}: {', '.join(changed[:5])} changed since the calibration, so the export would not be the "
+            "calibrated scene; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
+        )
     links = survey(result)
     if links is None:
         raise InputError(

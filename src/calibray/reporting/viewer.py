@@ -13,8 +13,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Paths, take
+from calibray.prediction.predict import changed_files, has_links
 from calibray.reporting.link_survey import Survey
 from calibray.result.record import Record
 from calibray.scenes import Triangles
@@ -58,12 +60,17 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
     """Find the strongest paths of every link; paths missing from the result are read from the cache or traced.
 
     Raises:
-        InputError: The scene or the links of the study can no longer be used.
+        InputError: The scene or the links of the study can no longer be used, or have changed.
         EngineError: The ray tracer failed.
     """
     paths = result.paths
     if paths is None:
-        paths = Setup.open(result.study).trace(progress=progress)
+        setup = Setup.open(result.study)
+        if changed := changed_files(result, setup.files):
+            raise InputError(f"{', '.join(changed[:5])} changed since the calibration")
+        if not has_links(result, setup.links):
+            raise InputError(f"the links in {setup.links.source} changed since the calibration")
+        paths = setup.trace(progress=progress)
     return strongest(paths, result)
 
 

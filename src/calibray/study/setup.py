@@ -314,15 +314,7 @@ class Setup:
     @cached_property
     def files(self) -> dict[str, str]:
         """SHA-256 of every file of the scene and the antennas, by its resolved path."""
-        antennas = [*self.study.stated_antennas.values(), *self.study.antenna_types.values()]
-        gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
-        digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
-        rays = [] if self.study.rays_path is None else [self.study.rays_path]
-        outlines = (*self.study.region_paths.values(), *self.study.facade_paths.values())
-        regions = [file for file in outlines if file is not None]
-        for file in (*cache.mesh_files(self.scene), *gains, *rays, *regions):
-            digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
-        return digests
+        return input_digests(self.study, self.scene)
 
     def tracer_at(self, frequency: float) -> Tracer:
         """A new ray tracer with the scene at another carrier [Hz]."""
@@ -463,6 +455,19 @@ class Setup:
     def _open_tracer(self, scene: Scene, frequency: float) -> Tracer:
         scene = without_facade_materials(scene, self.study.facades)
         return self.factory(scene, frequency, self.study.trace, *self.study.antenna_pair)
+
+
+def input_digests(study: StudyModel, scene: Scene) -> dict[str, str]:
+    """SHA-256 of every file of a study's scene, regions, facades, antennas and rays, by its resolved path."""
+    antennas = [*study.stated_antennas.values(), *study.antenna_types.values()]
+    gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
+    digests = {str(scene.path): hashlib.sha256(scene_content(scene.path)).hexdigest()}
+    rays = [] if study.rays_path is None else [study.rays_path]
+    outlines = (*study.region_paths.values(), *study.facade_paths.values())
+    regions = [file for file in outlines if file is not None]
+    for file in (*cache.mesh_files(scene), *gains, *rays, *regions):
+        digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return digests
 
 
 def _scene_of(study: StudyModel, frequency: float) -> Scene:
