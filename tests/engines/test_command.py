@@ -238,7 +238,7 @@ def test_predictions_at_new_links_are_answers_of_the_program(tmp_path):
     np.testing.assert_allclose(result.predict_interval(new).path_loss_db, told, atol=1e-6)
     assert len(programs.calls(tmp_path)) == before + 2
     programs.content(tmp_path, "sys.exit('no licence')")
-    with pytest.raises(EngineError, match=r"no licence.*A prediction needs this call"):
+    with pytest.raises(EngineError, match=r"no licence.*The prediction requires this call"):
         result.predict(new)
 
 

@@ -6,7 +6,7 @@ coefficient is a clipped weighted mean.
 
 Otherwise the normal equations have an arrowhead matrix: diagonal blocks bordered by a few columns. Columns of different
 groups share no link, so they form separate blocks. Columns over all links overlap with every block and form the border.
-Block elimination solves the system in about the time needed to read the matrix, for any number of groups.
+Block elimination solves the system in about the time needed to read the matrix, regardless of the number of groups.
 
 Block principal pivoting (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block pivoting and
 interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of Computation 63,
@@ -333,8 +333,8 @@ def _to_exchange(
     """Components to exchange [r, q]: all infeasible ones while their number decreases, then the last one of each part.
 
     `infeasible` is the mask of the infeasible components [r, q] of the unsolved problems `pending` [r]. For each
-    independent part [m, i], the function updates `fewest`, the smallest number so far, and `patience`, the remaining
-    full exchanges without progress, in place.
+    independent part [m, i], `fewest` (the smallest number so far) and `patience` (the remaining full exchanges without
+    progress) are updated in place.
     """
     parts = infeasible.reshape(len(infeasible), fewest.shape[1], -1)
     count = parts.sum(axis=2)

@@ -244,7 +244,7 @@ class Nuisance:
 
     @cached_property
     def layout(self) -> tuple[NDArray[np.int64], int, int]:
-        """Order of the columns that gives the normal equations an arrowhead form.
+        """Order of the columns for which the normal equations have an arrowhead form.
 
         Columns of different groups share no link, so the groups of one grouping form diagonal blocks.
 

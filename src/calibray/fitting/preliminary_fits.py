@@ -68,7 +68,7 @@ SEARCHES: Final = 32
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Set the weight of links whose predicted power is near the noise floor to 0, and mark them in `faint`.
+    """Set the weight of links with a predicted power near the noise floor to 0, and mark these links in `faint`.
 
     The problem is unchanged if there is no noise floor. It is also unchanged on an engine without derivatives, because
     its calls are expensive. If the remaining links determine fewer unknowns, the problem is unchanged and a warning is
@@ -142,7 +142,7 @@ def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the noise level that scales the priors (unless the study declares it) and the spread of random effects.
 
-    The problem is unchanged without priors. On an engine without derivatives, whose calls are expensive, the spread is
+    The problem is unchanged without priors. On an engine without derivatives, calls are expensive, so the spread is
     estimated at the initial values. The stage of `progress` is "estimating noise".
 
     Raises:
@@ -200,7 +200,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
     """The problem with the spreads of its random effects estimated at a point of the search space [d].
 
     The second result is the standard deviation of a link's error within the groups of the last effect [dB]. On an
-    engine without derivatives, both are estimated at the initial values, whose path loss is known.
+    engine without derivatives, both are estimated at the initial values, for which path loss is known.
     """
     objective = problem.objective
     counted = np.flatnonzero(objective.weight > 0)

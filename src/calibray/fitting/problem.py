@@ -39,8 +39,8 @@ class Evaluation(NamedTuple):
         jacobian: Their derivatives with respect to the search coordinates [n, m, d]; None if not requested.
         modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
-        represents: Number of full residuals that the m compressed ones represent; both have the same mean squares and
-            products. None if the residuals are not compressed.
+        represents: Number of full residuals that the m compressed residuals represent; both have the same mean squares
+            and products. None if the residuals are not compressed.
         observed: Further observables [n, K, L], in SI units; empty if the engine returned only sums.
     """
 

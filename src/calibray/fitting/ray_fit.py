@@ -85,7 +85,7 @@ class Ratio(NamedTuple):
     Attributes:
         call: The earlier call.
         here: Indices of the paths in the last call, ascending [n].
-        weight: Weights of the paths, whose sum over all ratios is 1 [n].
+        weight: Weights of the paths [n]; the sum over all ratios is 1.
         level_db: Power in the last call [n], [dB].
         observed: Power in the last call relative to that in the earlier one [n], [dB].
     """
@@ -327,7 +327,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
 
 
 def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.float64]:
-    """Constants at the last call and at the earlier ones, all for the paths of the last call."""
+    """Constants at the last call and at the earlier calls, all for the paths of the last call."""
     return model.tables([last.candidate, *(ratio.call.candidate for ratio in ratios)])
 
 

@@ -7,7 +7,7 @@ calls so far (`ray_fit.py`). The power of every path is then corrected to match 
 minimum of the replay of this corrected program, and tests this replay.
 
 The first call is at the start values. The second call is at the point where the ratios are most informative about the
-assumed constants: among `PROBES` random points, the one with the largest mean log determinant of the information
+assumed constants. Among `PROBES` random points, this point has the largest mean log determinant of the information
 matrix.
 """
 
@@ -60,9 +60,8 @@ RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to
 0.36 dB."""
 
 MISFIT_DB: Final = 0.2
-"""An engine counts as understood only if the misfit of its ratios is at most this large [dB]. Wrong minima had misfits
-of at least 0.8 dB. At 0.07 to 0.19 dB, the optimum was reached within 0.006 dB
-(docs/measurements/expensive-engines.md)."""
+"""An engine counts as understood only if the misfit of its ratios is at most this large [dB]. At 0.07 to 0.19 dB, the
+optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
 
 CHANGED_DB: Final = 0.5
 """An engine counts as understood only if paths that another call lacks change no link's path loss by more than this

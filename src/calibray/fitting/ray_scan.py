@@ -190,7 +190,7 @@ def _minima(
 
 
 class _Scanned(NamedTuple):
-    """The P paths of a scan with at most D interactions, at the last call and at C earlier ones.
+    """The P paths of a scan with at most D interactions, at the last call and at C earlier calls.
 
     P is always `SCANNED`, so that few functions are compiled. Missing paths have weight 0.
 

@@ -5,7 +5,7 @@ with the interval of that model, and the prediction is marked.
 
 The residual field is the correlated part of the calibration residuals, kriged to nearby links. Clutter that the scene
 lacks affects neighbouring links in the same way, so the residual near a measured link is partly known. The correlated
-part has an exponential covariance whose range and variance maximize the restricted likelihood
+part has an exponential covariance. Its range and variance maximize the restricted likelihood
 (`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the kriged field is zero.
 """
 
@@ -33,14 +33,14 @@ from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import without_scene
 
 MOST_EXACT: Final = 1000
-"""Largest number of measured links that are all used at every new link; if there are more, only the nearest ones are
+"""Largest number of measured links that are all used at every new link; if there are more, only the nearest links are
 used."""
 
 NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
 
 TOGETHER: Final = 500
-"""Number of new links whose kriging equations are solved together; each requires about 150 kB."""
+"""Number of new links for which the kriging equations are solved together; each link requires about 150 kB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Shift(NamedTuple):
 
     Attributes:
         value_db: Contribution with the best coefficients, then with each draw [1 + draws, links], [dB].
-        spread_db: Standard deviation at links whose group has no coefficient, 0 at other links [links], [dB].
+        spread_db: Standard deviation at links whose group has no coefficient; 0 at other links [links], [dB].
     """
 
     value_db: NDArray[np.float64]

@@ -187,7 +187,7 @@ def warn_of_carriers(result: Record, links: Measurements) -> None:
 
 
 def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) -> None:
-    """Refuse links whose receivers are all far from the scene, given the triangles of the scene.
+    """Refuse links if all their receivers are far from the scene, given the triangles of the scene.
 
     Nothing is refused if some triangles are unknown, because the size of the scene is then unknown.
 
@@ -224,7 +224,7 @@ def check_groups(result: Record, links: Measurements) -> None:
 
 
 def _with_columns(result: Record, setup: Setup) -> Setup:
-    """The opened study with the columns computed from the scene, if the prediction model or its errors need them."""
+    """The opened study with the columns computed from the scene, if the prediction model or its errors require them."""
     model = result.prediction.model
     used = any({term.by, term.per} & {*OBSTRUCTION, CLUSTER} for term in model.terms)
     differ = model.blocks is not None and model.blocks.out_of_sight > 1
@@ -316,7 +316,7 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
     """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales the blocks' part.
 
     Farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a factor of
-    up to two, because such a distant place differs from the blocks as much as these differ from each other. The
+    up to two. Such a distant position differs from the blocks as much as the blocks differ from each other. The
     contribution of random effects to these errors is subtracted, because `nuisance_shift` adds their spread for links
     of a new group.
     """
@@ -391,7 +391,9 @@ def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64
     """
     answers = list(cast(Answering, program).answers(values))
     if failure := next((answer.failure for answer in answers if answer.failure), ""):
-        raise EngineError(f"{failure}. A prediction needs this call: correct the program, and predict again")
+        raise EngineError(
+            f"{failure}. The prediction requires this call: correct the program, and predict again"
+        )
     return np.stack([each.path_loss_db for each in sorted(answers, key=lambda each: each.index)])
 
 
@@ -429,7 +431,7 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
 
 
 def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
-    """Refuse a scene or an antenna whose file has changed since the calibration.
+    """Refuse a scene or an antenna with a file that has changed since the calibration.
 
     Raises:
         InputError: A file has changed.

@@ -85,13 +85,13 @@ def suggest(
         observables: Also report which further observable is worth measuring at each suggestion.
 
     Returns:
-        One row per suggestion, best first. The columns are the candidate's row, its positions [m] and group;
-        path_loss_db and spread_db, the mean and the standard deviation of the draws' predictions [dB]; NAME_width for
-        every parameter, the expected width of its 95 % interval once this candidate and those above are measured;
-        NAME_sure for a parameter with several ranges, the expected probability that the right range is known; and gain,
-        a summary as text. With `observables`, there are also the columns observable, the quantity that narrows the
-        intervals most if it is measured in addition to path loss at this candidate and those above, and
-        observable_gain, a summary as text.
+        One row per suggestion, best first. The first columns are the candidate's row, its positions [m] and its group.
+        The columns path_loss_db and spread_db are the mean and the standard deviation of the draws' predictions [dB].
+        For every parameter, NAME_width is the expected width of its 95 % interval once this candidate and those above
+        are measured. For a parameter with several ranges, NAME_sure is the expected probability that the right range is
+        known. The column gain is a summary as text. With `observables`, the column observable names the quantity that
+        narrows the intervals most if it is measured in addition to path loss at this candidate and those above. The
+        column observable_gain is a summary as text.
 
     Raises:
         InputError: `Result.predict` would refuse the input for a reason other than unknown groups; the calibration has

@@ -123,7 +123,7 @@ class JointModel:
     Attributes:
         study: The study's d parameters.
         parameters: The study's parameters, then k constants that the scene fixes.
-        priors: Log-normal priors, in addition to flat ones over the unit cube.
+        priors: Log-normal priors, in addition to flat priors over the unit cube.
         gaps: Computes measured minus modelled path loss.
         loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
@@ -415,7 +415,7 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 
 
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Weights of the links in the likelihood [L], and mask of the censored ones [L].
+    """Weights of the links in the likelihood [L], and mask of the censored links [L].
 
     With censored links in the likelihood, links measured near the noise floor are also used, so that links are not
     selected by their measured values.

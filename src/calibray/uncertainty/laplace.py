@@ -1,4 +1,4 @@
-"""Laplace's approximation of error densities whose integrals over nuisance and scale have no closed form.
+"""Laplace's approximation of error densities if their integrals over nuisance and scale have no closed form.
 
 There are two models of heavy tails. Either the errors follow Student's t, with tails that decrease gradually, or most
 errors are Gaussian and a few are gross, for example because a link's position was recorded incorrectly. Gross errors

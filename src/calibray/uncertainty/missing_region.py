@@ -54,7 +54,7 @@ class Explained(NamedTuple):
 
 @dataclass(frozen=True)
 class MissingRegion:
-    """A rectangle whose extra loss would explain part of the residuals.
+    """A rectangle with an extra loss that would explain part of the residuals.
 
     Attributes:
         box: West, south, east and north sides in the scene frame [m].

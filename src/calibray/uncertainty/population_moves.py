@@ -70,7 +70,7 @@ class Population:
         return Population(*(part[index] for part in self.parts()))
 
     def updated(self, accepted: NDArray[np.bool_], proposal: Population) -> Population:
-        """The members of the proposal where accepted [n], otherwise the current ones."""
+        """The members of the proposal where it is accepted [n], otherwise the current members."""
         return Population(
             *(
                 np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)

@@ -2,10 +2,11 @@
 
 Path loss and further observables may contradict each other by more than their errors explain, so that they require
 different parameters. The parameters are fitted to path loss alone, to the further observables alone, and to both. The
-increase in both sums of squares from the separate fits to the common fit, divided by the variances of the errors and by
-the number of parameters, follows an F distribution if one set of parameters explains all data. It is also possible that
-no parameter values explain an observable, as if it were measured in a different scene. Measured values are therefore
-regressed on modelled values. The slope is 1 if the model is right, and near 0 if the two are unrelated.
+test statistic is the increase in both sums of squares from the separate fits to the common fit, divided by the
+variances of the errors and by the number of parameters. It follows an F distribution if one set of parameters explains
+all data. It is also possible that no parameter values explain an observable, as if it were measured in a different
+scene. Measured values are therefore regressed on modelled values. The slope is 1 if the model is right, and near 0 if
+the two are unrelated.
 """
 
 from __future__ import annotations
@@ -227,7 +228,7 @@ def outside_interval(
     log_odds: float,
     noise: Mapping[str, float],
 ) -> tuple[Remark, ...]:
-    """A remark that names the parameters whose calibrated values lie outside their intervals, and the cause.
+    """A remark that names the parameters with calibrated values outside their intervals, and the cause.
 
     Args:
         problem: The problem.

@@ -46,7 +46,7 @@ NEAREST: Final = 20
 """Number of neighbours in Vecchia's approximation."""
 
 CHUNK: Final = 500
-"""Number of links whose neighbourhoods are solved together."""
+"""Number of links for which the equations of the neighbourhoods are solved together."""
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
 """An order of the links [m], and the indices in this order of each link's nearest earlier links [m, NEAREST]; -1 for
@@ -135,7 +135,7 @@ def fit_correlation(
 def _restricted(
     matrix: NDArray[np.float64], errors: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Restricted log likelihood of errors whose covariance is `matrix` times a variance, and the best variance."""
+    """Restricted log likelihood of errors with the covariance `matrix` times a variance, and the best variance."""
     factor = cho_factor(matrix, lower=True)
     freedom = len(errors) - columns.shape[1]
     solved = cho_solve(factor, np.column_stack([errors, columns]))

@@ -32,9 +32,9 @@ EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: the number of steps times the number of moves per step."""
 
 POPULATIONS: Final = (2, 4, 8)
-"""Numbers of independent populations, increased while their two halves disagree. If several interference fringes of
-slabs fit, the mean of a population of 256 members scatters by 0.2 posterior standard deviations. In three development
-districts, the draws of two or four populations agree for half of the true scenes."""
+"""Numbers of independent populations; the number is increased as long as the two halves disagree. If several
+interference fringes of slabs fit, the mean of a population of 256 members scatters by 0.2 posterior standard
+deviations. In three development districts, the draws of two or four populations agree for half of the true scenes."""
 
 SWEEPS: Final = 4
 """Number of sweeps per step; a sweep applies each kind of move to every member. The share of one of two distant ranges

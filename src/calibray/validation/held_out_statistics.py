@@ -2,8 +2,8 @@
 
 The interval is conformal: among n + 1 exchangeable errors, a new error has every rank with the same probability. The
 absolute value of a new error is therefore at most the ((n + 1) p)-th smallest of the n observed absolute errors with
-probability p, whatever their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World,
-2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a
+probability p, regardless of their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random
+World, 2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a
 Gaussian, so an interval from their root mean square would be too wide at 90 %. If there are few errors, the largest
 ones are too uncertain, and Student's t is used instead.
 
@@ -90,7 +90,7 @@ def moving_end(links: Measurements) -> NDArray[np.float64]:
 
 
 def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but keep each place in one block [n].
+    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but keep each position in one block [n].
 
     Example:
         >>> place_blocks(np.array([[0.0, 0, 1], [0.0, 0, 4], [0.0, 0, 7], [9.0, 0, 1]]), 2).tolist()

@@ -300,7 +300,7 @@ def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) 
 
 
 def averages(path_loss_db: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """Path loss of every average whose two models are among those given, by name [links], [dB]."""
+    """Path loss of every average for which both models are given, by name [links], [dB]."""
     return {
         average: (path_loss_db[first] + path_loss_db[second]) / 2
         for average, (first, second) in AVERAGES.items()
