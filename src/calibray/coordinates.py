@@ -100,9 +100,9 @@ class Frame:
         """
         keys = ("easting", "northing", "height")
         if not isinstance(record, Mapping) or not isinstance(record.get("crs"), str):
-            raise InputError(f"frame {record!r}: needs crs, easting, northing and height")
+            raise InputError(f"frame {record!r}: must contain crs, easting, northing and height")
         if not all(isinstance(record.get(key), float | int) for key in keys):
-            raise InputError(f"frame {record!r}: needs easting, northing and height in metres")
+            raise InputError(f"frame {record!r}: must contain easting, northing and height in metres")
         return cls(record["crs"], *(float(record[key]) for key in keys))
 
     def record(self) -> dict[str, str | float]:
@@ -182,7 +182,7 @@ def transformer(source: object, target: object) -> Transformer:
 def find_projection(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: Sequence[float], high: Sequence[float]
 ) -> str | None:
-    """Find the map projection of coordinates by testing which projection places them on a scene.
+    """Find the map projection of given coordinates by testing which projection places them on a scene.
 
     Candidates are the UTM zone of the scene, Web Mercator, and the EPSG projections that cover the scene.
 

@@ -16,14 +16,14 @@ from typing import Final, Literal
 from calibray.support.messages import printable
 
 LISTED: Final = 12
-"""Largest number of rows, names or findings that are listed; any others are only counted."""
+"""Largest number of rows, names or findings that are listed; further ones are only counted."""
 
 WIDEST: Final = 100_000
 """Number of characters per line if the output is not a terminal or the terminal is too narrow; large enough for every
 cell."""
 
 ROWS: Final = 10
-"""Largest number of rows of a table shown at the prompt; any others are only counted."""
+"""Largest number of rows of a table shown at the prompt; further rows are only counted."""
 
 CHARACTERS: Final = 60
 """Largest number of characters shown of a cell or a name; longer texts are cut."""

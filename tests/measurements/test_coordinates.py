@@ -55,7 +55,7 @@ def test_utm_frames_have_the_right_zone_and_origin():
 def test_a_frame_survives_its_record():
     frame = Frame("EPSG:32632", 691_000.0, 5_334_000.0, 510.0)
     assert Frame.from_record(frame.record()) == frame
-    with pytest.raises(InputError, match="needs easting"):
+    with pytest.raises(InputError, match="must contain easting"):
         Frame.from_record({"crs": "EPSG:32632"})
 
 

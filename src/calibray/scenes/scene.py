@@ -124,11 +124,11 @@ def read_scene(
         source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
         frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
         overrides: Constants that replace those in the file, by material name: a `Material`, or a mapping of its fields.
-            The mapping may also contain `itu`, an ITU-R P.2040 material, and `revision`, which applies to `itu` or to
+            The mapping can also contain `itu`, an ITU-R P.2040 material, and `revision`, which applies to `itu` or to
             the ITU material in the file.
-        split: Separate materials for certain objects: maps the name of each new material to a pattern of object names,
-            in which `*` matches any text. If the material name ends in `*`, each object gets its own material, with `*`
-            replaced by the object's name.
+        split: Separate materials for certain objects: a mapping from the name of each new material to a pattern of
+            object names, in which `*` matches any text. If the material name ends in `*`, each object gets its own
+            material, with `*` replaced by the object's name.
 
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene; a mesh is missing or malformed; a material has no

@@ -325,9 +325,10 @@ def antenna_response(
 ) -> tuple[Any, Any, Any]:
     """Response of a mounted antenna: amplitude, and components (cos, sin) of its theta vector in the waves' basis.
 
-    Each result is [P]; the basis is that of `wave_basis`. There is one pose for each path; if `index` [P] is given,
-    paths share poses. `xp` is the array library: NumPy, or `jax.numpy` within a JAX function that is differentiated
-    with respect to the pose. `stored` prevents intermediate values from being computed again at each use.
+    Each result has the shape [P]; the basis is that of `wave_basis`. There is one pose for each path; if `index` [P] is
+    given, paths share poses. `xp` is the array library: NumPy, or `jax.numpy` within a JAX function that is
+    differentiated with respect to the pose. `stored` prevents intermediate values from being computed again at each
+    use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)

@@ -42,7 +42,7 @@ def trace_digest(
     antennas: tuple[Antenna, Antenna],
     links: Links,
 ) -> str:
-    """Fingerprint (SHA-256, in hexadecimal) of everything that determines a trace.
+    """Fingerprint (SHA-256, in hexadecimal) of all inputs that determine a trace.
 
     The scene's materials are included, because they determine how rays continue.
     """

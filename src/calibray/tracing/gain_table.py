@@ -6,7 +6,8 @@ antenna radiates most. Nulls that are narrower than the grid spacing become shal
 
 Planning tools export a horizontal and a vertical cut in MSI Planet's text format (`TwoCuts`). Attenuations are relative
 to the gain in the header. Horizontal angles are measured clockwise from the main direction, as seen from above.
-Vertical angles are measured downwards from the horizon in front of the antenna, through the nadir to its back.
+Vertical angles are measured downwards from the horizon in front of the antenna, through the nadir to the back of the
+antenna.
 """
 
 from __future__ import annotations

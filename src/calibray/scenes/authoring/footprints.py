@@ -148,13 +148,13 @@ class Footprints:
 
 
 def clean_footprints(raw: Footprints) -> Footprints:
-    """Repair outlines so that they can be extruded: on a grid, without self-intersections, and not too small.
+    """Prepare outlines for extrusion: round corners to a grid, remove self-intersections, and drop small outlines.
 
     Corners are rounded to multiples of `GRID`; outlines with less area than `SMALLEST` are left out. Repairs
     are counted. Repeated names are made unique.
 
     Raises:
-        InputError: A height is not a number or above `HIGHEST`, or the buildings are farther apart than `WIDEST`.
+        InputError: A height is not a number or is above `HIGHEST`, or the buildings are farther apart than `WIDEST`.
     """
     shapely = library("shapely", "scenes")
     valid = shapely.is_valid(raw.polygon)

@@ -38,7 +38,7 @@ from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
 
 CONVERGED_DB: Final = 0.05
-"""Largest change of a link's path loss in a round that counts as converged [dB]."""
+"""Largest change of a link's path loss in a round at which the link counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
 """Number of consecutive rounds without a larger change after which the search ends."""
 MAX_LAUNCHES: Final = 256

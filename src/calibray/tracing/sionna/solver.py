@@ -64,7 +64,7 @@ class Rays:
         count: Number of rays; with 0, only direct paths are searched for.
         seed: Seed of the random numbers.
         directions: Directions as points of the unit square [2, count]; Sionna's own lattice if None.
-        direct: Whether direct paths are searched for as well.
+        direct: Whether direct paths are also searched for.
         buffer_size: Initial size of the buffer [candidates]; a full buffer is replaced by a larger one.
         max_paths: Number of candidates that fit into memory.
     """
