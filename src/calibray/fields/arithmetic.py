@@ -4,7 +4,7 @@ Compilers vectorize pairs of real arrays, which are therefore several times fast
 pairs work element by element and are differentiable.
 
 A segment consists of the paths of a link, or the interactions of a link with a material. XLA scatters and adds one
-number at a time, which takes about 5 ns. Most numbers can be added in blocks instead: numbers are ordered so that each
+number at a time, which takes about 5 ns. Most numbers can be added in blocks instead. Numbers are ordered so that each
 block belongs to one segment, and only the remainder of each segment is scattered.
 """
 

@@ -156,8 +156,8 @@ class DisplacementLoss:
 
         At each of the three inner knots, the change is compared with the straight line between the two neighbours. The
         RMS differences of the axes add in quadrature. For a step of J dB next to the middle knot, the result is J /
-        sqrt(6), the RMS error of linear interpolation across a step at any position; for a step in an outer interval,
-        it is J / sqrt(12).
+        sqrt(6), the RMS error of linear interpolation across a step at any position. For a step in an outer interval,
+        the result is J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:

@@ -2,7 +2,7 @@
 
 Paths of a group have interactions of the same kinds in the same order, so that every step of a group is a dense array.
 With padding, paths that differ only in the lengths of their runs of reflections and transmissions belong to the same
-group, and shorter runs are padded with interactions that have no effect.
+group. Shorter runs are padded with interactions that have no effect.
 """
 
 from __future__ import annotations

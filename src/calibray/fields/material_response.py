@@ -221,9 +221,9 @@ def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
 def _whole_normalizations() -> NDArray[np.float64]:
     """Coefficients of F_alpha for alpha = 0 .. LARGEST_EXPONENT [terms, alpha].
 
-    F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j; for odd j it is multiplied by cos
-    theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The result contains the coefficients of cos theta
-    sin^2w theta, highest power first, then the constant.
+    F_alpha = 2^-alpha sum_j binom(alpha, j) I_j. I_j is 2 pi / (j + 1) for even j; for odd j, this value is multiplied
+    by cos theta sum_{w <= (j - 1) / 2} binom(2w, w) (sin^2 theta / 4)^w. The result contains the coefficients of cos
+    theta sin^2w theta, highest power first, then the constant.
     """
     alpha = np.arange(LARGEST_EXPONENT + 1)
     j, w = alpha[:, None], np.arange(LARGEST_EXPONENT // 2)[::-1, None]

@@ -36,7 +36,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
-        and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured
+        and standard deviation of the residuals [dB] on the calibration links. Residuals are predicted minus measured
         values of the measured quantity. "obstruction" and "streets": the same, by the length of the straight line below
         roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would explain
         the largest part of the residuals. "leverage": leverage and residual of every calibration link. "power": share
