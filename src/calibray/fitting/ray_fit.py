@@ -34,8 +34,8 @@ EXACT_DB: Final = 0.005
 """Misfit at which a search ends [dB]."""
 
 KNOWN_DB: Final = 0.02
-"""Misfit below which the explanation of earlier calls is kept for the next one [dB]; wrong minima had misfits of
-at least 0.1 dB."""
+"""Misfit below which the explanation of earlier calls is kept for the next call [dB]; wrong minima had misfits of at
+least 0.1 dB."""
 
 EVALUATIONS: Final = (6, 12, 30)
 """Largest number of evaluations with each loss function: in a trial, between scans, and in the last refinement."""

@@ -200,7 +200,7 @@ class _Scanned(NamedTuple):
         cosine: Cosine of the angle of incidence [D, P].
         through: Whether the interaction is a transmission [D, P].
         rotation: Cosine and sine of the rotation into the frame of incidence [D, 2, P].
-        constants: Permittivity, conductivity and thickness at every call, the last one first [C + 1, 3, D, P].
+        constants: Permittivity, conductivity and thickness at every call, last call first [C + 1, 3, D, P].
         tx: Fields at the transmitter [T, 2, P].
         rx: Conjugate fields at the receiver [R, 2, P].
         wavelength: Wavelength [m].

@@ -100,7 +100,7 @@ def predict_batches(
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
     """Predict the links of a table batch by batch, so that memory use does not grow with their number.
 
-    All rows are checked before the first one is traced. The table has the columns that `predict` reads. The stages of
+    All rows are checked before the first link is traced. The table has the columns that `predict` reads. The stages of
     `progress` are "checking" and "tracing".
 
     Yields:

@@ -49,7 +49,7 @@ from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 
 MOST_DRAWS: Final = 96
-"""Largest number of posterior draws by which the candidates are ranked."""
+"""Largest number of posterior draws that are used to rank the candidates."""
 
 VALUES_PER_RANGE: Final = 24
 """Number of further values in each separate range of a parameter, because some ranges contain few draws."""

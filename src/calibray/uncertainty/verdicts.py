@@ -121,7 +121,8 @@ TRADE_OFF: Final = 0.5
 """Rank correlation above which another parameter is reported to compensate for a parameter."""
 
 LARGE_EFFECT: Final = 3.0
-"""Change of path loss, in standard deviations of the errors, above which one link would determine the parameter."""
+"""Change of path loss, in standard deviations of the errors, above which a single link would determine the
+parameter."""
 
 RANKED: Final = 400
 """Number of draws of equal weight from which rank correlations are computed."""
