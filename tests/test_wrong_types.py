@@ -86,7 +86,7 @@ def test_columns_of_a_map_are_a_dictionary(result: cb.Result, columns: Any) -> N
     ("arguments", "message"),
     [
         ({"engine": "replay"}, r"engine: is 'replay', .* study\.replace\(engine=NAME\)"),
-        ({"workers": 4}, r"workers: is 4, must be the workers of engines\.open_workers"),
+        ({"workers": 4}, r"workers: is 4, must be workers from engines\.open_workers"),
         ({"cheap_model": "study.toml"}, "cheap_model: is 'study.toml', must be a Study"),
     ],
 )

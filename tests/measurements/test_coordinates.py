@@ -63,7 +63,7 @@ def test_a_frame_survives_its_record():
     ("crs", "message"),
     [
         ("EPSG:4326", "not a projection in metres"),
-        ("EPSG:999999", "PROJ does not know"),
+        ("EPSG:999999", "unknown to PROJ"),
         ("EPSG:2263", "in metres"),
         # Transverse Mercator of southern Africa: x counts to the west and y to the south.
         ("EPSG:2048", "with x pointing east and y pointing north"),
