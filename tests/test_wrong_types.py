@@ -107,7 +107,7 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
         r"links: is a pandas\.DataFrame, must have positions",
         lambda: cb.trace("sionna:munich", table, frequency=3e9),
     )
-    refused(r"not a pandas\.DataFrame; read_measurements reads a file", lambda: cb.trace(study, table))
+    refused(r"not a pandas\.DataFrame; use read_measurements", lambda: cb.trace(study, table))
     refused("frequency = '3e9': must be a finite number", lambda: cb.itu_material("concrete", "3e9"))
     refused("frequency = '3e9': must be in 1e", lambda: paths.at("3e9"))
     name = next(iter(paths.materials))

@@ -164,7 +164,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
         (PROFILE | {"kind": "azimuth_power_arrival"}, "takes no edges"),
         (
             {**PROFILE, "kind": "azimuth_power_arrival", "edges": [], "edges_deg": [0, 180, 400]},
-            "must span 360",
+            "must span at most 360",
         ),
         ({**SPREAD, "column": None, "columns": ["a", "b"]}, "has one column"),
     ],
@@ -276,7 +276,7 @@ def test_a_number_for_a_missing_time_of_flight_is_no_time(tmp_path, table):
     study = planted.study(tmp_path, table.assign(rtt_ns=rtt_ns), **(PLAN | {"observables": {"rtt": FLIGHT}}))
     links = study.measurements()
     assert np.flatnonzero(links.frame["rtt_ns"].isna()).tolist() == [3]
-    assert links.prepared == {"values of rtt_ns that mean not measured (-200)": 1}
+    assert links.prepared == {"codes for missing values in rtt_ns (-200)": 1}
 
 
 def test_averages_have_means_of_a_column_and_stay_apart_by_the_labels_of_a_file(tmp_path, table):

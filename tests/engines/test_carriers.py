@@ -190,7 +190,7 @@ def test_paths_of_some_links_are_theirs_in_any_order(folder: Path) -> None:
         ((0.0,), r"frequency = 0\.0: must be in 1e\+06 to 1e\+12 Hz"),
         ((28.5,), r"frequency = 28\.5: .*write 28\.5 GHz as 28\.5e9"),
         ((float("nan"),), "frequency = nan"),
-        ((1e9, {"glass": None}), "no material 'glass' in the traced scene; it has soil, walls"),
+        ((1e9, {"glass": None}), "no material 'glass' in the traced scene, which has soil, walls"),
     ],
 )
 def test_carriers_that_are_none_and_materials_that_are_not_there(
@@ -395,7 +395,10 @@ def test_prediction_takes_the_carrier_of_each_link_or_else_the_scenes(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (28.5, r"row 3: the frequency 28\.5 must be in 1e\+06 to 1e\+12 Hz .*write 28\.5 GHz as 28\.5e9"),
+        (
+            28.5,
+            r"row 3: the frequency 28\.5 must be between 1e\+06 and 1e\+12 Hz .*write 28\.5 GHz as 28\.5e9",
+        ),
         (-1e9, r"row 3: the frequency -1e\+09 must be"),
         (np.nan, r"column 'carrier' is missing or not finite in 1 of 24 rows \(row 3\)"),
     ],
@@ -413,7 +416,9 @@ def test_a_column_of_too_many_frequencies_or_none(folder: Path) -> None:
     plan = study(folder, name="many")
     frame = pd.concat([pd.read_csv(plan.links_path)] * 2).assign(carrier=np.arange(48) * 1e6 + 1e9)
     frame.to_csv(plan.links_path, index=False)
-    with pytest.raises(InputError, match="48 different frequencies, must be at most 32; give the carrier"):
+    with pytest.raises(
+        InputError, match="48 different frequencies, but at most 32 are allowed; give the carrier"
+    ):
         plan.measurements()
     links = plan.links.model_dump() | {"frequency": "carier"}
     with pytest.raises(InputError, match="no column 'carier'; did you mean 'carrier'"):
@@ -430,7 +435,9 @@ def test_the_same_value_at_another_carrier_is_no_repeat(folder: Path) -> None:
 
 def test_a_law_that_leaves_physics_at_a_carrier_is_refused_with_it(folder: Path) -> None:
     wide = {**LAW, "walls.itu_b": {"bounds": [-0.4, 0.1]}}
-    message = r"walls\.itu_a = 3 with itu_b = -0\.4 gives relative_permittivity = 0\.7911 at 28 GHz, must be"
+    message = (
+        r"walls\.itu_a = 3 with itu_b = -0\.4 results in relative_permittivity = 0\.7911 at 28 GHz, must be"
+    )
     with pytest.raises(InputError, match=message):
         engines.make(study(folder, parameters=wide))
 

@@ -141,7 +141,7 @@ def test_a_program_that_answers_no_observables_is_at_fault(tmp_path):
         ({"observables": {"spread": {**SECTION, "std": None}}}, r"observables.spread.std: is required"),
         ({"noise": {"kind": "gaussian"}}, r"noise.std_db: is required"),
         ({"engine": {"name": "retrace"}}, "use 'replay' or 'command'"),
-        ({"engine": {"name": "replay", "compress_db": 0.1}}, "few weighted paths keep path loss"),
+        ({"engine": {"name": "replay", "compress_db": 0.1}}, "few weighted paths preserves path loss"),
     ],
 )
 def test_what_observables_need_of_an_engine(tmp_path, sections, message):

@@ -179,7 +179,7 @@ def test_censored_links_inform_intervals_but_not_the_rmse(tmp_path):
     missing = table["power"].isna().to_numpy()
     assert found.links["censored"].to_numpy(bool).tolist() == missing.tolist()
     assert found.links["faint"].to_numpy(bool)[missing].all()
-    assert found.provenance.rows["at or below the noise floor, counted as censored"] == missing.sum() == 4
+    assert found.provenance.rows["at or below the noise floor, treated as censored"] == missing.sum() == 4
     assert found.counts["calibrated_on"] <= 8
     held = [
         interval.pieces[0][0] <= planted.TRUTH[name] <= interval.pieces[-1][1]

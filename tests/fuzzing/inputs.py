@@ -307,7 +307,7 @@ def read(file: Path, plain: list[list[float]] | None) -> list[float]:
     rows = np.stack([*links.rx[:, :2].T, links.path_loss_db], axis=1)
     if plain is None:  # what the plainest means cannot read can only be the undamaged table
         plain = [[float(cell) for cell in row.split(",")[:3]] for row in world.LINKS.splitlines()[1:]]
-    if any(text.startswith("values that mean not measured") for text in links.prepared):
+    if any(text.startswith("codes for missing values") for text in links.prepared):
         plain = [row for row in plain if 0 < row[2] <= 190]  # codes such as -1 or 0, left out and counted
     if len({tuple(row[:2]) for row in plain}) < len(plain):
         return rows.ravel().tolist()  # rows that repeat a link are merged

@@ -239,12 +239,12 @@ ASKED = {
     "OpenCellID cells": (
         "lat,lon,mcc,mnc,lac,cellid,averageSignalStrength,range,samples",
         "50.0,9.9,262,1,20,1294,0,1000,3",
-        "no column looks like path loss, path gain or received power",
+        "no column appears to contain path loss, path gain or received power",
     ),
-    "Quality only": ("lat,lon,RSRQ,SINR", "50.0,9.9,-12,5", "no column looks like"),
-    "Signal in percent": ("x,y,SSID,Signal Quality", "1,2,net,74", "no column looks like"),
-    "Round-trip times only": ("X,Y,RTT(mm),AP", "1,2,5120,1", "no column looks like"),
-    "Neighbours only": ("Lat,Lon,NRxRSRP,NRxRSRQ", "50.0,9.9,-120,-18", "no column looks like"),
+    "Quality only": ("lat,lon,RSRQ,SINR", "50.0,9.9,-12,5", "no column appears to contain"),
+    "Signal in percent": ("x,y,SSID,Signal Quality", "1,2,net,74", "no column appears to contain"),
+    "Round-trip times only": ("X,Y,RTT(mm),AP", "1,2,5120,1", "no column appears to contain"),
+    "Neighbours only": ("Lat,Lon,NRxRSRP,NRxRSRQ", "50.0,9.9,-120,-18", "no column appears to contain"),
     "Pixel coordinates": ("col,row,rssi", "120,80,-70", "position"),
 }
 
@@ -324,7 +324,9 @@ def test_units_of_length_are_read_from_names(names, unit):
 
 
 def test_several_units_of_length_are_asked_about():
-    with pytest.raises(InputError, match=r"different units \(X \[cm\], height_m\); give all in metres"):
+    with pytest.raises(
+        InputError, match=r"different units \(X \[cm\], height_m\); give all positions in metres"
+    ):
         column_names.find_length_unit(["X [cm]", "height_m", "n"])
 
 
@@ -346,7 +348,7 @@ def test_flight_times_are_found_by_their_full_name_and_are_no_times_of_day(name,
 def test_values_are_judged_without_the_codes_of_missing_ones():
     table = SourceTable(pd.DataFrame({"x": 1.0, "rssi": [100.0, 100.0, 100.0, -71.0, -80.0]}))
     guess = column_names.find_value(table)
-    assert (guess.column, guess.reason) == ("rssi", "its name, and values of about -76")
+    assert (guess.column, guess.reason) == ("rssi", "by its name and values of about -76")
     assert np.isfinite(table.frame["rssi"]).all()
 
 

@@ -76,15 +76,15 @@ def test_a_table_in_windows_1252_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (PLAIN + "4,5,6\n", "row 5: 3 cells, the header has 4"),
-        (PLAIN + "4,5,a,-70,\n", "row 5: 5 cells, the header has 4"),
-        ("x,y,cell,rssi\n1,2,3\n4,5,6\n", "row 2: 3 cells, the header has 4"),
+        (PLAIN + "4,5,6\n", "row 5: 3 cells, but the header has 4"),
+        (PLAIN + "4,5,a,-70,\n", "row 5: 5 cells, but the header has 4"),
+        ("x,y,cell,rssi\n1,2,3\n4,5,6\n", "row 2: 3 cells, but the header has 4"),
         (PLAIN.replace("-71", "-71 dB").replace("-70.5", "-70.5 dBm"), "'-70.5 dBm' is not a number"),
         (PLAIN.replace("-71", "-71 dBm"), "'-71 dBm' is not a number"),
         (PLAIN.replace("-71", "none"), "'none' is not a number"),
         (PLAIN.replace("-70.5", "dBm"), "'dBm' is not a number"),
-        ("1,2,3\n4,5,6\n", "row 1: contains numbers; add a line with the column names"),
-        ("Logger\n" + PLAIN + "4,5,6\n", "cells, the header has"),
+        ("1,2,3\n4,5,6\n", "row 1: contains numbers; insert a line with the column names"),
+        ("Logger\n" + PLAIN + "4,5,6\n", "cells, but the header has"),
     ],
 )
 def test_a_fault_is_refused_and_not_taken_for_a_layout(tmp_path, text, message):
@@ -97,7 +97,7 @@ def test_a_comma_that_may_separate_thousands_is_refused(tmp_path, mark):
     """Read as a decimal comma, 1,234 and 567 would be 1.234 and 567."""
     rows = ["x;rssi", "1,234;-70", "567;-71"]
     with pytest.raises(
-        InputError, match=r"row 2: '1,234' can mean 1.234 or 1234, because its column also has"
+        InputError, match=r"row 2: '1,234' can mean 1.234 or 1234, because its column also contains"
     ):
         read(tmp_path, "\n".join(rows).replace(";", mark))
     for clear in ("0,567;-71", "567,000;-71", "567,5;-71"):

@@ -136,13 +136,17 @@ def test_anything_else_is_refused_without_side_effects(expression, tmp_path, mon
     [
         ("x > 1 and x.to_csv('f')", "to_csv() is not allowed", "use one of: abs, between"),
         ("x.isin([(x.to_csv)('f')])", "(x.to_csv)('f'): must be", "a number, a text"),
-        ("x > 7**7**7**7", "7**7**7: the result is too large", "correct it"),
+        ("x > 7**7**7**7", "7**7**7: the result is too large", "correct the expression"),
         ("x > 1 and sett == 'LOS'", "no column 'sett'", "did you mean 'set'"),
         ("set.str.contans('a')", "contans() is not allowed", "did you mean 'contains'"),
         ("x.values > 1", "x.values: not allowed", "use comparisons"),
         ("~x > 3", "x: must be true or false", "parentheses"),
         ("y == None", "None: not allowed", "use isna() or notna()"),
-        ("set.str.contains('(a+)+')", "contains('(a+)+'): only characters", "regex=False"),
+        (
+            "set.str.contains('(a+)+')",
+            "contains('(a+)+'): a pattern can contain only characters",
+            "regex=False",
+        ),
         ("`my column` + ok > 1", "ok: must be a number", "for arithmetic"),
     ],
 )
@@ -195,7 +199,7 @@ def test_whole_numbers_do_not_wrap_around():
     assert evaluate("n * 2.0 > 4", frame).tolist() == [False, True]
     assert evaluate("n ** 3 > 4", frame).tolist() == [False, True]
     for expression in ("n * 4 > 4", "n + n + n > 4", "b * b > 4", "b - 100 > 4"):
-        with pytest.raises(InputError, match="too large a number"):
+        with pytest.raises(InputError, match="too large"):
             evaluate(expression, frame)
 
 

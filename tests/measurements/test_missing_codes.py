@@ -36,7 +36,7 @@ def test_rows_with_codes_are_left_out_and_counted():
     frame = pd.DataFrame({"x": [10.0, 20.0, 30.0, 40.0], "rssi": [-70, 100, -200, -80]})
     links = measured_links(SourceTable(frame), COLUMNS)
     assert links.path_loss_db.tolist() == [70.0, 80.0]
-    assert links.prepared == {"values that mean not measured (-200, 100)": 2}
+    assert links.prepared == {"codes for missing values (-200, 100)": 2}
 
 
 def test_codes_are_below_the_noise_floor():
@@ -50,7 +50,7 @@ def test_codes_of_a_wide_table_are_empty_cells():
     wide = pd.DataFrame({"x": [0.0, 5.0], "ap1": [-40, 100], "ap2": [100, -61]})
     long = select_rows(SourceTable(wide), Preparation({"ap1": "1", "ap2": "2"}), "rssi")
     assert long.frame["rssi"].tolist() == [-40.0, -61.0]
-    assert long.changes == {"values that mean not measured (100)": 2, "cells without a value": 2}
+    assert long.changes == {"codes for missing values (100)": 2, "cells without a value": 2}
 
 
 def test_further_codes_are_stated():

@@ -91,7 +91,7 @@ def test_the_unit_of_delays_is_that_of_their_name(tmp_path, name):
 @pytest.mark.parametrize(
     ("columns", "factor", "reason"),
     [
-        ({"delay_ns": "delay"}, 1.0, "state its unit"),
+        ({"delay_ns": "delay"}, 1.0, "state the unit"),
         ({}, -1.0, "losses must be positive"),
         ({"path_loss_db": "path_gain_db"}, 1.0, "gains and powers negative"),
         ({"path_loss_db": "power_mw"}, 1e-9, "gains and powers negative"),
@@ -161,7 +161,7 @@ def test_snapshots_of_one_component_do_not_count_in_the_k_factor(tmp_path):
 
 def test_a_table_without_delays_is_refused(tmp_path):
     TABLE.drop(columns="delay_ns").to_csv(tmp_path / "multipath.csv", index=False)
-    with pytest.raises(InputError, match="no column for a delay"):
+    with pytest.raises(InputError, match="no column with a delay"):
         read_multipath(tmp_path / "multipath.csv", "id")
 
 
@@ -245,7 +245,7 @@ def test_impulse_responses_that_fit_no_links_are_refused(tmp_path, responses):
     np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match="cannot be read"):
         read_impulse_responses(tmp_path / "objects.npy", ["a"], RATE)
-    with pytest.raises(InputError, match="no file is named like a link"):
+    with pytest.raises(InputError, match="no file has the name of a link"):
         read_impulse_responses(tmp_path, ["x"], RATE)
 
 
@@ -253,7 +253,9 @@ def test_delays_in_another_unit_are_refused(tmp_path, responses):
     np.savez(tmp_path / "cir.npz", cir=responses, delay=np.arange(SAMPLES) / RATE * 1e9)
     np.save(tmp_path / "cir.npy", responses)
     for file, rate in (("cir.npz", None), ("cir.npy", RATE / 1e6)):
-        with pytest.raises(InputError, match=r"has a delay of .* s, must be at most 0.01 s; give delays in"):
+        with pytest.raises(
+            InputError, match=r"has a delay of .* s, but the largest allowed delay is 0.01 s; give delays in"
+        ):
             read_impulse_responses(tmp_path / file, ["a", "b"], rate)
 
 

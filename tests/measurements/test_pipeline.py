@@ -165,5 +165,5 @@ def test_a_track_of_another_age_is_refused(tmp_path, year):
     )
     (tmp_path / "walk.gpx").write_text(f"<gpx><trk><trkseg>{points}</trkseg></trk></gpx>")
     rows = SourceTable(pd.DataFrame({"time": ["2020-01-01T00:00:01Z"]}))
-    with pytest.raises(InputError, match=r"walk\.gpx: a time is not ISO 8601 or out of range"):
+    with pytest.raises(InputError, match=r"walk\.gpx: a time is not in ISO 8601 or is out of range"):
         join_track(rows, Track(str(tmp_path / "walk.gpx"), "time"))

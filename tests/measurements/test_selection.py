@@ -65,9 +65,9 @@ def test_powers_at_or_below_the_noise_floor_are_left_out_or_set_to_it():
     assert left.changes == {"at or below the noise floor, left out": 3}
     censored = select_rows(rows, Preparation(noise_floor_dbm=-120.0, censored=True), "power")
     assert censored.frame["power"].tolist() == [-100.0, -120.0, -119.9, -120.0, -120.0]
-    assert censored.changes == {"at or below the noise floor, counted as censored": 3}
+    assert censored.changes == {"at or below the noise floor, treated as censored": 3}
     assert rows.frame["power"].isna().sum() == 1
-    with pytest.raises(InputError, match="left out: all of 5 rows"):
+    with pytest.raises(InputError, match="left out: all 5 rows"):
         select_rows(rows, Preparation(noise_floor_dbm=-10.0), "power")
 
 
@@ -139,7 +139,7 @@ def test_a_filter_sees_the_columns_of_a_track(tmp_path):
         (gpx(""), None, "no track point has a time"),
         (gpx('<trkpt lat="1" lon="1"/>'), None, "no track point has a time"),
         (gpx('<trkpt lat="x" lon="1"/>'), None, "a point is malformed"),
-        (gpx('<trkpt lat="1" lon="1"><time>noon</time></trkpt>'), None, "not ISO 8601"),
+        (gpx('<trkpt lat="1" lon="1"><time>noon</time></trkpt>'), None, "not in ISO 8601"),
         ("<gpx", None, "not well-formed"),
         (gpx(point(1, 1, 0) + point(1, 1, 9)), "2026-05-01T12:00:05", "none of 1 times .* is on the track"),
         (gpx(point(1, 1, 0)), "noon", "log.csv, column 'time': a time cannot be read"),
@@ -170,7 +170,9 @@ def test_a_time_zone_with_which_more_rows_lie_on_the_track_is_named(join):
     # Rows before the track have no position with any clock: a recorder that started late.
     early = [str(minute - pd.Timedelta(minutes=20)) for minute in minutes]
     assert join(track, [*early, *local[-70:]], longest_gap=60.0).changes == {note: 65}
-    with pytest.raises(InputError, match=r"with links\.track\.clock = 7260, some are; check the time zone"):
+    with pytest.raises(
+        InputError, match=r"with links\.track\.clock = 7260, some would be; check the time zone"
+    ):
         join(track, [str(minutes[-1] + pd.Timedelta(hours=2))], longest_gap=60.0, clock=60.0)
 
 

@@ -110,7 +110,7 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
         (lambda: Parameter("walls.itu_e", 0.0, 1.0, 0.5), "no field 'itu_e'; did you mean 'itu_"),
         (
             lambda: start_value("walls.thickness", "itu:concrete", BASE, 4e9),
-            "ITU-R P.2040 gives no thickness",
+            "ITU-R P.2040 does not specify thickness",
         ),
         (
             lambda: start_value("walls.itu_a", "itu:concret", BASE, 4e9),
@@ -120,15 +120,15 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
             lambda: Parameters(
                 (Parameter("walls.conductivity", 0.0, 1.0, 0.1), Parameter("walls.itu_d", 0.0, 1.0, 0.1))
             ),
-            "'walls.conductivity' is the same at every carrier and 'walls.itu_d' belongs to its law; remove one",
+            "'walls.conductivity' is independent of frequency, but 'walls.itu_d' is a coefficient of its law",
         ),
         (
             lambda: parameters("walls.itu_a", "walls.thickness").matrix_indices(list(BASE)),
-            r"parameters walls\.itu_a, walls\.thickness: coefficients of laws have no cell in a constants matrix",
+            r"parameters walls\.itu_a, walls\.thickness: coefficients of laws have no cell in a matrix of constants",
         ),
         (
             lambda: parameters("walls.itu_a").check_carriers([4e9, 10e9]),
-            r"walls\.itu_a = 0\.01 with itu_b = 0 gives relative_permittivity = 0\.01 at 4 GHz, must be a finite "
+            r"walls\.itu_a = 0\.01 with itu_b = 0 results in relative_permittivity = 0\.01 at 4 GHz, must be a finite "
             "number not below 1; narrow the bounds",
         ),
     ],

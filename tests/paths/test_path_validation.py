@@ -55,8 +55,8 @@ def test_a_path_file_of_other_origin_is_read_in_a_process_once(paths, tmp_path, 
 @pytest.mark.parametrize(
     ("program", "message"),
     [
-        ("import time; time.sleep(60)", "does not finish reading it within"),
-        ("import os; os.abort()", "the HDF5 library fails while reading it"),
+        ("import time; time.sleep(60)", "does not finish reading the file within"),
+        ("import os; os.abort()", "the HDF5 library fails while reading the file"),
         ("import sys; print('is damaged (x)'); sys.exit(3)", r"is damaged \(x\)"),
     ],
 )

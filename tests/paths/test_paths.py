@@ -224,7 +224,7 @@ def test_changed_file_is_refused_until_it_is_sealed(paths: Paths, tmp_path: Path
     with h5py.File(file, "a") as content:
         content["paths/delay"][0] *= 2
     with pytest.raises(
-        InputError, match=r"paths\.h5: is damaged \(its checksum does not match\); trace again"
+        InputError, match=r"paths\.h5: is damaged \(the checksum does not match\); trace again"
     ):
         Paths.load(file)
     seal(file)
@@ -493,11 +493,11 @@ def test_material_table_replaces_materials_by_name(paths: Paths) -> None:
     assert changed[1, FIELDS.index("thickness")] == 0.004
     assert (changed != table).sum() == 1
     with pytest.raises(
-        InputError, match="no material 'steel' in the traced scene; it has walls, glass, ground"
+        InputError, match="no material 'steel' in the traced scene, which has walls, glass, ground"
     ):
         paths.material_table({"steel": glass})
     with pytest.raises(
-        InputError, match="'walls': scattering_pattern 'directive' differs from the traced 'lambertian'"
+        InputError, match="'walls': scattering_pattern 'directive' differs from 'lambertian' in the trace"
     ):
         paths.material_table({"walls": glass})
 

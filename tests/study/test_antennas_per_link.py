@@ -227,7 +227,7 @@ def test_arrays_are_steered_per_transmitter_from_columns(planted: Study) -> None
 @pytest.mark.parametrize(
     ("tx", "links", "message"),
     [
-        ({"steering_deg": 5.0}, {}, "tx_antenna.steering_deg: the antenna is not an array; give antennas.tx rows"),
+        ({"steering_deg": 5.0}, {}, "tx_antenna.steering_deg: the antenna is not an array; state rows and columns"),
         ({"type": "transmitter"}, {}, r"row 2, column 'transmitter': 'north' is not an antenna of .antennas.types."),
         ({"azimuth_deg": "heading"}, {}, "no column 'heading'"),
         ({"azimuth_deg": 720.0}, {}, "links.tx_antenna.azimuth_deg: 720 must be -360 to 360; give degrees"),

@@ -266,7 +266,7 @@ def test_impossible_facades_are_refused(tmp_path, sections, message):
     ("facades", "message"),
     [
         ({"shop": {"of": "marbel", "share": 0.2}}, "no material 'marbel'"),
-        ({"wood": {"of": "marble", "share": 0.2}}, "has a material of this name"),
+        ({"wood": {"of": "marble", "share": 0.2}}, "has a material with this name"),
     ],
 )
 def test_facades_that_do_not_fit_the_scene_are_refused(facades, message):

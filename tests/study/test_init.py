@@ -88,8 +88,8 @@ def test_a_phones_log_becomes_a_study_that_reads(scene, tmp_path):
 @pytest.mark.parametrize(
     ("column", "offsets", "reason"),
     [
-        ("Gerät", "Zelle, Gerät", "each transmitter and each receiver has its own gain"),
-        ("Straße", "Zelle", "no column of devices was found; each transmitter has its own gain"),
+        ("Gerät", "Zelle, Gerät", "each transmitter and each receiver has a different gain"),
+        ("Straße", "Zelle", "no column of devices was found; each transmitter has a different gain"),
     ],
 )
 def test_the_reason_of_the_offsets_says_which_columns_were_found(scene, tmp_path, column, offsets, reason):
@@ -232,7 +232,7 @@ def test_trees_next_to_the_scene_become_a_region(scene, tmp_path):
     assert (section.file, section.heights, section.top) == ("town/trees.geojson", "ground", "top")
     assert section.specific_attenuation == pytest.approx(0.45 * 3.5**0.284, abs=0.005)
     assert "region:trees.specific_attenuation" in found.study.parameters
-    assert any("on the straight line of 1 of 3 links" in each.reason for each in found.assumptions)
+    assert any("on the straight lines of 1 of 3 links" in each.reason for each in found.assumptions)
     assert found.study.regions["trees"].file in found.text
     # Without trees on the straight line of a link, their attenuation is no parameter.
     elsewhere = draft(
@@ -317,7 +317,8 @@ def test_a_value_below_a_limit_is_refused_with_the_key_that_states_the_limit(sce
     file = table(tmp_path, x=[2.0, -4.0], y=-15.0, rsrp_a=["-80", "<-95"], rsrp_b=["-85", "-90"])
     (tmp_path / "masts.csv").write_text("name,x,y,z\na,-20,0,9\nb,-60,0,9\n")
     with pytest.raises(
-        InputError, match="row 3, column 'rsrp_a': '<-95' is not a number; write the limit itself, and"
+        InputError,
+        match="row 3, column 'rsrp_a': '<-95' is not a number; write the limit without this sign, and",
     ):
         draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 3.5e9)
 
@@ -378,7 +379,7 @@ def test_quantities_are_told_by_name_and_sign(column, values, kind):
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"x": [1.0], "y": [2.0], "temperature": [20.0]}, "no column looks like path loss"),
+        ({"x": [1.0], "y": [2.0], "temperature": [20.0]}, "no column appears to contain path loss"),
         ({"a": [1.0], "pl_db": [90.0]}, "no columns of receiver positions"),
         ({"x": [1.0], "y": [2.0], "pl_db": [90.0]}, "--tx X,Y,Z"),
         ({"lon": [9.99], "lat": [50.01], "tx_x": [0.0], "tx_y": [0.0], "pl_db": [90.0]}, "different units"),
@@ -396,13 +397,13 @@ def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
     [
         (
             {"Lat": "50.01N", "Lon": 9.99, "RSRP": -80.0},
-            "'Lat' contains text such as '50.01N': write numbers",
+            "'Lat' contains text such as '50.01N'; write numbers",
         ),
         ({"lat": 5000.6, "lon": 959.4, "RSRP": -80.0}, "'lat' has values of about 5001, not degrees"),
         ({"x": 0.0, "y": 30.0, "RSRP": ["<-110"] + ["-80"] * 9}, "'RSRP' contains text such as '<-110'"),
         (
             {"x": 0.0, "y": 30.0, "Signal": 84.0},
-            "'Signal' has values of about 84, and received powers .* negative",
+            "'Signal' has values of about 84, but received powers .* negative",
         ),
     ],
 )
@@ -434,11 +435,11 @@ def test_codes_of_missing_values_and_unknown_transmitters_are_reported(scene, tm
     drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
     assert reasons["links.where"] == "sites.csv lacks C, D: 2 rows are left out"
-    assert reasons["links.missing"] == "far from all other values of rssi: not measured"
+    assert reasons["links.missing"] == "far from all other values of rssi, therefore treated as missing"
     assert drafted.study.links.missing == (100.0,)
     assert drafted.study.links.noise_floor_dbm == -80.0
     links = drafted.study.measurements()
-    assert links.prepared["values that mean not measured (100)"] == 2
+    assert links.prepared["codes for missing values (100)"] == 2
     assert links.path_loss_db.max() < 80.0
 
 
@@ -467,7 +468,7 @@ def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(sce
     assert links.tx[:, 0].tolist() == [-30, -30, 60, 60, -30, -30, 60, 60, -30]
     # A column of numbers that happen to agree names nothing.
     other = table(tmp_path, x=np.arange(10.0), y=20.0, layer=[1, 2] * 5, rssi=np.arange(-80, -70))
-    with pytest.raises(InputError, match="no column names the transmitter of a row"):
+    with pytest.raises(InputError, match="no column contains the transmitters of the rows"):
         draft(scene, other, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
 
 
@@ -557,7 +558,7 @@ def test_the_origin_of_a_scene_without_a_frame_places_degrees(scene, tmp_path):
         *("init", scene, links, "--frequency", 3.5e9, "--origin", f"{longitude},{latitude}", "--out", target)
     )
     assert code == 0, errors
-    assert "--origin states the scene's position" in " ".join(shown.split())
+    assert "--origin states the georeference of the scene" in " ".join(shown.split())
     placed = Study.load(target).measurements()
     np.testing.assert_allclose(placed.rx[:, :2], np.stack([east, north], axis=1), atol=0.02)
     np.testing.assert_allclose(placed.tx[:, :2], 0.0, atol=0.02)

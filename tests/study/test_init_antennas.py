@@ -131,7 +131,9 @@ def test_sectors_of_a_planners_table_become_a_study(scene, tmp_path):
     setup = Setup.open(found.study)
     assert np.degrees(np.unique(setup.mountings["tx"].pose.yaw)) == pytest.approx([-70.0, 70.0])
     reasons = {each.what: each.reason for each in found.assumptions}
-    assert "--antennas, a folder of the MSI files that column Antenna Model names" in reasons["antennas"]
+    assert (
+        "give a folder of the MSI files named in column Antenna Model with --antennas" in reasons["antennas"]
+    )
 
 
 def test_files_are_matched_by_name_and_hold_the_electrical_tilt(scene, tmp_path, files, monkeypatch):
@@ -157,10 +159,10 @@ def test_files_are_matched_by_name_and_hold_the_electrical_tilt(scene, tmp_path,
 def test_a_missing_file_or_angle_is_named(scene, tmp_path, files):
     (files / "K80010677_06T.MSI").unlink()
     with pytest.raises(
-        InputError, match=r"no file for 'k80010677_06t' of column 'Antenna Model'.*rename them"
+        InputError, match=r"no file for 'k80010677_06t' of column 'Antenna Model'.*rename the files"
     ):
         drafted(scene, tmp_path, SECTORS, antennas=files)
-    with pytest.raises(InputError, match=r"has no file \*.msi"):
+    with pytest.raises(InputError, match=r"contains no file \*.msi"):
         drafted(scene, tmp_path, SECTORS, antennas=tmp_path)
     gap = SECTORS.assign(Azimuth=[20.0, None], MTilt=[2.0, 200.0])
     found = drafted(scene, tmp_path, gap)

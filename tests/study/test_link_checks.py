@@ -121,7 +121,7 @@ def test_coefficients_of_nuisance_terms_are_unknowns(town):
         (lambda t: t.assign(z=t.z + 540), "60 of 60 receivers are more than 300 m above the whole scene"),
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
          "5 of 60 receivers are inside buildings"),
-        (lambda t: t.assign(loss=t.loss - 30), "path losses are below free space, by"),
+        (lambda t: t.assign(loss=t.loss - 30), "path losses are below free-space loss, by"),
         (lambda t: t.assign(z=np.where(t.index < 5, 0.0, t.z)), "5 of 60 receivers touch the ground"),
     ],
     ids=["swapped", "turned", "origin", "jump", "underground", "altitudes", "indoors", "watts", "height"],
@@ -153,7 +153,7 @@ def test_delays_of_paths_far_longer_than_the_scene_are_named(town, unit, is_name
     """Delay spreads of some 30 ns in a town of 200 m; in microseconds they are those of paths of 9 km."""
     frame = links().assign(spread=np.linspace(5.0, 60.0, 60))
     observables = {"ds": {"kind": "rms_delay_spread", "column": "spread", "unit": unit}}
-    named = "column 'spread' [us] is the time light takes for 9743 m"
+    named = "column 'spread' [us] corresponds to a path length of 9743 m"
     assert (named in suspicions(town, frame, observables=observables)) == is_named
     assert is_named or suspicions(town, frame, observables=observables) == ""
 
@@ -177,7 +177,7 @@ def test_a_corridor_that_guides_waves_is_no_mistake(tmp_path):
     study = Study.from_content(content, tmp_path / "study.toml")
     setup = Setup.open(study)
     modelled = engines.make(setup).path_loss(np.array([[2.0]]))[0]
-    named = "path losses are below free space"
+    named = "path losses are below free-space loss"
     for shift, is_named in ((0.0, False), (-30.0, True)):
         frame.assign(loss=modelled + shift).to_csv(tmp_path / "links.csv", index=False)
         problems = [finding.problem for finding in examine(study, study.measurements())]
@@ -190,7 +190,7 @@ def test_the_gain_of_an_array_is_no_mistake(town):
     frame = links()
     distance = np.linalg.norm(frame[["x", "y", "z"]] - MAST, axis=1)
     best = frame.assign(loss=20 * np.log10(4 * np.pi * distance * 3.5e9 / 299792458) - 26)
-    named = "path losses are below free space"
+    named = "path losses are below free-space loss"
     assert named in suspicions(town, best)
     assert named not in suspicions(town, best, antenna=array)
     assert named in suspicions(town, best.assign(loss=best.loss - 10), antenna=array)
@@ -280,8 +280,8 @@ def test_upward_tilts_and_relative_gains_are_named(town):
 @pytest.mark.parametrize(
     ("column", "quantity", "named"),
     [
-        ("rsrp_dbm", "path_gain", "is named like a received power"),
-        ("path_gain_db", "rsrp", "is named like a loss or gain"),
+        ("rsrp_dbm", "path_gain", "has the name of a received power"),
+        ("path_gain_db", "rsrp", "has the name of a loss or gain"),
     ],
 )
 def test_decibels_taken_for_others(town, column, quantity, named):
@@ -365,7 +365,7 @@ def test_a_log_with_many_rows_while_parked_is_named(town):
     effective = len(parked) ** 2 / np.sum(repeats**2)
     found = suspicions(town, parked)
     assert "100 of 159 links have the same position" in found
-    assert f"60 positions count as about {effective:.0f} positions" in found
+    assert f"60 positions are equivalent to about {effective:.0f} positions" in found
     equal = frame.loc[np.repeat(frame.index, 10)].reset_index(drop=True)
     assert suspicions(town, equal.assign(time=np.arange(len(equal)))) == ""
     assert suspicions(town, parked, links={"average": "place"}) == ""

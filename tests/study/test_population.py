@@ -137,6 +137,6 @@ def test_traces_and_their_check_have_the_stated_antennas(folder: Path) -> None:
 
 def test_only_all_transmitters_have_a_spread(folder: Path) -> None:
     with pytest.raises(
-        InputError, match=r"tx:S1.azimuth: spread describes a population of transmitters; give it to"
+        InputError, match=r"tx:S1.azimuth: spread describes a population of transmitters; state it for"
     ):
         study(folder, "stated.csv", **{"tx:S1.azimuth": {"bounds": [-9, 9], "spread": "auto"}})

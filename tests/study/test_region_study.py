@@ -111,11 +111,11 @@ def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine, co
     [
         ({"regions": {}}, r"no \[regions\.trees\]"),
         ({"regions": {"trees": REGIONS["trees"] | {"boxes": []}}}, "a canopy or boxes"),
-        ({"regions": {"trees": REGIONS["trees"] | {"canopy": "c.tif"}}}, "give exactly one of them"),
+        ({"regions": {"trees": REGIONS["trees"] | {"canopy": "c.tif"}}}, "give exactly one of these"),
         ({"regions": {"trees": {"boxes": [BOX], "specific_attenuation": 0.3}}}, r"needs top \[m\]"),
         ({"regions": {"trees": REGIONS["trees"] | {"boxes": [[5, 0, 1, 2]]}}}, "west less than east"),
         ({"regions": {"trees": REGIONS["trees"] | {"bottom": 9.0}}}, "must be less than top"),
-        ({"regions": {"trees": REGIONS["trees"] | {"top": "h"}}}, "columns need a file"),
+        ({"regions": {"trees": REGIONS["trees"] | {"top": "h"}}}, "column names need a file"),
         (
             {
                 "regions": {},
@@ -143,7 +143,7 @@ def test_files_and_columns_that_cannot_be_used_are_named(tmp_path):
     point = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [1, 2]}}
     (tmp_path / "trees.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [point]}))
     opened = Setup.open(study(tmp_path, regions={"trees": section}), links=links_from_frame(planted.links()))
-    with pytest.raises(InputError, match="none of its 1 features is a polygon"):
+    with pytest.raises(InputError, match="none of the 1 features is a polygon"):
         opened.effects(planted.engine().paths)
     metres = {"type": "Polygon", "coordinates": [[[200, 0], [210, 0], [210, 5], [200, 0]]]}
     feature = {"type": "Feature", "properties": {"h": 8.0}, "geometry": metres}
@@ -226,7 +226,9 @@ def test_a_polygon_without_ground_below_it_is_refused_by_its_number():
     surfaces = SceneSurfaces(np.array(faces, float), np.zeros((0, 3, 3)), np.array([0, 0, 0, 100, 100, 0.0]))
     boxes = ((400, 0, 410, 9), (10, 10, 20, 20), (60, 60, 90, 90))
     section = RegionSection(boxes=boxes, top=8.0, heights="ground", specific_attenuation=0.3)
-    with pytest.raises(InputError, match=r"boxes: the scene has no ground below polygon 3; remove it"):
+    with pytest.raises(
+        InputError, match=r"boxes: the scene has no ground below polygon 3; remove the polygon"
+    ):
         section.region(None, Place(None, lambda: surfaces))
 
 

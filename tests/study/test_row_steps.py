@@ -196,7 +196,7 @@ def test_averages_stay_within_transmitter_and_group(folder):
     ("links", "message"),
     [
         ({"transmitter": "phone"}, "no column 'phone'"),
-        ({"noise_floor_dbm": -10.0}, "all of 16 rows"),
+        ({"noise_floor_dbm": -10.0}, "all 16 rows"),
         ({"quantity": "path_loss", "noise_floor_dbm": -100.0}, "is a received power"),
         ({"average": {"by": "time", "size": 3.0}}, "needs time"),
         ({"quantity": "received_power"}, "set quantity = 'rsrp' and add an \\[offset\\]"),
@@ -280,7 +280,7 @@ def test_average_by_place_takes_no_size_and_other_averages_need_one(folder):
     assert len(links) == 16  # two phones, two sites, four positions
     assert study(folder, average={"by": "place"}).links == study(folder, average="place").links
     for average, message in (
-        ({"by": "place", "size": 1.0}, "by = 'place' takes no size"),
+        ({"by": "place", "size": 1.0}, "by = 'place' has no size"),
         ({"by": "cell"}, "by = 'cell' needs size"),
         ({"by": "place", "minimum_count": 0}, "minimum_count"),
     ):

@@ -159,7 +159,7 @@ def test_what_only_the_scene_can_tell_is_refused_with_the_study_named(folder):
     study = load(folder)
     with pytest.raises(InputError, match=r"study\.toml: .*no material 'walls'; did you mean 'wall'"):
         study.parameter_set({"wall": BASE["walls"], "soil": BASE["soil"]})
-    with pytest.raises(InputError, match=r"soil\.conductivity: start = 2 lies outside bounds"):
+    with pytest.raises(InputError, match=r"soil\.conductivity: start = 2 is outside bounds"):
         study.parameter_set(BASE | {"soil": Material(2.25, 2.0, 0.5)})
 
 
@@ -217,7 +217,7 @@ TRACE = "max_depth = 4"
         ("frequency = 4e9", "", "study.toml: scene.frequency: is required"),
         ("version = 1", "", "study.toml: version: is required"),
         # Values
-        ("version = 1", "version = 2", "study.toml: version = 2: this Calibray reads version 1"),
+        ("version = 1", "version = 2", "study.toml: version = 2: this version of Calibray reads version 1"),
         ("frequency = 4e9", "frequency = 4", "scene.frequency = 4: must be from 1e+06 to 1e+12 Hz"),
         ("frequency = 4e9", "frequency = '4e9'", "scene.frequency = '4e9': must be a number"),
         ("frequency = 4e9", "frequency = inf", "scene.frequency = inf: must be a finite number"),
@@ -236,7 +236,7 @@ TRACE = "max_depth = 4"
         ('combining = "band"', 'combining = "sum"', "objective.combining = 'sum': must be one of 'power', "),
         ("bandwidth = 2e8", "", "objective.combining = 'band' needs scene.bandwidth"),
         ("ceiling_db = 150", "", "objective: no_path = 'censor' needs ceiling_db"),
-        ('"received_power"', '"rsrp"', "with links.quantity = 'rsrp': the transmitted power is unknown"),
+        ('"received_power"', '"rsrp"', "with links.quantity = 'rsrp': the largest path loss is unknown"),
         ('no_path = "censor"', "", "ceiling_db = 150 has no effect"),
         ("bounds = [-10, 10]", "bounds = [10, -10]", "offset.bounds = [10, -10]: the lower bound"),
         ("seed = 7", "seed = -7", "method.seed = -7: must be at least 0"),
@@ -248,7 +248,7 @@ TRACE = "max_depth = 4"
         ('itu = "concrete"', 'itu = "floorboard"', "covers 'floorboard' at 50 to 100 GHz, not at 4"),
         ("[1.5, 12.0]", "[12.0, 1.5]", "bounds = [12.0, 1.5] are reversed"),
         ("[1.5, 12.0]", "[0.5, 12.0]", "walls.relative_permittivity: bounds = [0.5, 12.0]: 0.5 must be"),
-        ("[1.5, 12.0]", "[1.5, 4.0]", "start = 5.31 lies outside bounds = [1.5, 4]"),
+        ("[1.5, 12.0]", "[1.5, 4.0]", "start = 5.31 is outside bounds = [1.5, 4]"),
         ("walls.relative_permittivity", "walls.permittivity", "no field 'permittivity'; did you mean"),
         ("itu:concrete@", "itu:concrte@", "start = 'itu:concrte@P.2040-1': 'concrte' is not a material"),
         ("itu:concrete@", "concrete@", "must be a number or 'itu:NAME'"),

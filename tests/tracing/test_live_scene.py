@@ -231,12 +231,12 @@ def test_what_is_not_a_matrix_of_path_loss_is_refused(measured: np.ndarray, tmp_
     refused(np.where(first, np.inf, measured), "tx0, rx0: inf, must be a finite real number")
     refused(measured + 1j, r"tx0, rx0: \(.*j\), must be a finite real number")
     refused(frame.astype(object).mask(first, "-"), "tx0, rx0: '-', must be")
-    refused("measured.csv", "read a file first")
+    refused("measured.csv", "read the file first")
     refused([[1.0, 2.0], [3.0]], "not a matrix of numbers")
     refused(frame.iloc[[0, 0]], "row 'tx0' is repeated; give one row for each transmitter")
     refused(frame.iloc[:, [2, 2]], "column 'rx2' is repeated")
     refused(measured > 80, "tx0, rx0: (True|False), must be a finite real number")
-    refused(measured, "set scene.frequency there", scene={"frequency": 28e9})
+    refused(measured, "set its attribute frequency", scene={"frequency": 28e9})
     refused(measured, r"links: is \[1\], must be a dictionary", links=[1])
     refused(measured, "offset: is None, must be a dictionary", offset=None)
 
@@ -248,7 +248,7 @@ class OtherFrame(np.ndarray):
 
 
 def test_columns_of_other_packages_are_not_taken_in_the_order_of_the_scene(measured: np.ndarray) -> None:
-    with pytest.raises(InputError, match=r"measured: is a .*OtherFrame, whose rows have no names"):
+    with pytest.raises(InputError, match=r"measured: is a .*OtherFrame, which has no row names"):
         cb.Study.from_sionna(street(), measured[:, ::-1].view(OtherFrame))
 
 

@@ -231,7 +231,7 @@ def test_a_study_is_traced_with_what_it_says(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"frequency": 2e9}, r"the study .*study\.toml states frequency; change it there"),
+        ({"frequency": 2e9}, r"the study .*study\.toml states frequency; change"),
         ({"max_depth": 2}, "states max_depth"),
         ({"rx_antenna": "dipole"}, "states rx_antenna"),
         ({"measurements": LINKS}, "must be Measurements"),

@@ -1,6 +1,6 @@
-"""Measured links: reading positions, path losses, weights and groups from tables, and checking them.
+"""Measured links: positions, path losses, weights and groups, read from tables and checked.
 
-`reading.measured_links` is the pipeline that converts the rows of a table to `Measurements`.
+`reading.measured_links` converts the rows of a table to `Measurements`.
 """
 
 from calibray.measurements.links import FEW as FEW

@@ -1,4 +1,4 @@
-"""Guess the contents of a table's columns from the words in their names and from their values."""
+"""Infer the contents of the columns of a table from the words in the column names and from the values."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ PATTERNS: Final = {
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Recognized spellings of column names, without accents. To add a spelling, extend its row; case and punctuation do not
-matter."""
+"""Recognized spellings of column names, without accents. To add a spelling, extend the row. Case and punctuation are
+ignored."""
 
 LENGTH_UNITS: Final = {
     "cm": 0.01,
@@ -78,24 +78,24 @@ LENGTH_UNITS: Final = {
     "foot": 0.3048,
     "inch": 0.0254,
 }
-"""Units of length, other than the metre, that column names may state, each with its length [m]."""
+"""Units of length other than the metre that column names can state, with the length of each unit [m]."""
 
 WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
-"""Words in a column's name that show that its powers are not in dBm."""
+"""Words in a column name that indicate powers in a unit other than dBm."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-"""Units of carrier frequency that column names may state, each with its value in hertz."""
+"""Units of carrier frequency that column names can state, with the value of each unit in hertz."""
 
 
 @dataclass(frozen=True)
 class PositionColumns:
-    """The columns that give the position of one end of a link.
+    """The columns with the position of one end of a link.
 
     Attributes:
         position: "scene" for metres, "geographic" for degrees.
         x: Column of x coordinates, or of longitudes.
         y: Column of y coordinates, or of latitudes.
-        height: Column of heights; None if the table has none.
+        height: Column of heights; None without such a column.
     """
 
     position: Literal["scene", "geographic"]
@@ -111,7 +111,7 @@ class ValueColumn:
     Attributes:
         column: Name of the column.
         quantity: The measured quantity.
-        reason: Why the column was chosen.
+        reason: Reason for choosing the column.
     """
 
     column: str
@@ -131,7 +131,7 @@ def without_accents(name: object) -> str:
 
 
 def words(name: object) -> frozenset[str]:
-    """Words in a column's name, in lower case; a camel-case word counts both as a whole and in parts.
+    """Words in a column name, in lower case. A camel-case word is included both as a whole and in parts.
 
     Example:
         >>> sorted(words("Rx_X [m]"))
@@ -154,7 +154,7 @@ def words(name: object) -> frozenset[str]:
 
 
 def matches(name: object, *rows: str) -> bool:
-    """Whether a word of a column's name matches one of the given rows of `PATTERNS`.
+    """Whether a word in a column name matches one of the given rows of `PATTERNS`.
 
     Example:
         >>> matches("RSRP [dBm]", "received power"), matches("RSRP [dBm]", "x", "y")
@@ -164,9 +164,9 @@ def matches(name: object, *rows: str) -> bool:
 
 
 def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Find the column of round-trip times or times of flight, its kind and its unit; None if there is none.
+    """Find the column of round-trip times or times of flight, with its kind and unit; None without such a column.
 
-    Wi-Fi devices may also state the round trip as a distance in metres.
+    Some Wi-Fi devices report a distance in metres instead of a time.
 
     Example:
         >>> find_flight_time(pd.DataFrame({"rtt_std_ns": [2.0], "rtt_ns": [80.0]}))
@@ -195,11 +195,11 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Hint at a column that matches one of the given rows of `PATTERNS` but is not numeric; empty if there is none.
+    """Hint at a column that matches a given row of `PATTERNS` but is not numeric; empty without such a column.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
-        "; column 'Lat' contains text such as '51.2N': write numbers"
+        "; column 'Lat' contains text such as '51.2N'; write numbers"
     """
     for name in frame:
         if str(name) not in numeric_columns(frame) and matches(name, *rows):
@@ -207,31 +207,31 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
             bad = cells[pd.to_numeric(cells, errors="coerce").isna()]
             if len(bad):
                 cell = shortened(str(bad.iloc[0]))
-                return f"; column {shortened(str(name))!r} contains text such as {cell!r}: write numbers"
+                return f"; column {shortened(str(name))!r} contains text such as {cell!r}; write numbers"
     return ""
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint at a column that is named longitude or latitude but does not contain degrees; empty if there is none.
+    """Hint at a longitude or latitude column that does not contain degrees; empty without such a column.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
-        "; column 'lat' has values of about 4734, not degrees: write 47.5687 for 4734.12 (NMEA), or x, y for metres"
+        "; column 'lat' has values of about 4734, not degrees; convert NMEA values, or name columns in metres x and y"
     """
     for name in numeric_columns(frame):
         largest = 90 if matches(name, "latitude") else 180
         if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
             return (
-                f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees: write 47.5687 for "
-                "4734.12 (NMEA), or x, y for metres"
+                f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees; convert NMEA "
+                "values, or name columns in metres x and y"
             )
     return ""
 
 
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
-    """Find the columns that give the position of one end; metres are preferred to degrees.
+    """Find the columns with the position of one end. Columns in metres take precedence over columns in degrees.
 
-    With `unnamed`, columns whose names mention neither transmitter nor receiver may also belong to this end.
+    With `unnamed`, columns with names that indicate neither transmitter nor receiver can also belong to this end.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -256,7 +256,10 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
 
 
 def _height(names: Iterable[str]) -> str | None:
-    """The first column of antenna heights, or else of other heights, except those of the ground or a building."""
+    """The first column of antenna heights, or else of other heights.
+
+    Heights of the ground or of buildings are ignored.
+    """
     heights = [name for name in names if matches(name, "height") and not matches(name, "another height")]
     return min(heights, key=lambda name: not matches(name, "antenna"), default=None)
 
@@ -269,11 +272,11 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values, and its quantity.
 
-    Path loss takes precedence over path gain, and path gain over received power; RSSI without a decibel unit comes
-    last. The sign of the values distinguishes loss from gain.
+    Path loss takes precedence over path gain, path gain over received power, and all of these over RSSI without a
+    decibel unit. The sign of the values distinguishes loss from gain.
 
     Raises:
-        InputError: No column looks like measured values.
+        InputError: No column appears to contain measured values.
     """
     kinds: tuple[tuple[str, Quantity], ...] = (
         ("path loss", "path_loss"), ("path gain", "path_gain"), ("received power", "rsrp"),
@@ -292,23 +295,23 @@ def find_value(table: SourceTable) -> ValueColumn:
         elif table.frame[name].notna().any():
             median = float(table.frame[name].median())
             unlikely = (
-                f"; column {name!r} has values of about {median:.0f}, and received powers in dBm are negative"
+                f"; column {name!r} has values of about {median:.0f}, but received powers in dBm are negative"
             )
     if not candidates:
         raise InputError(
-            f"{table.source}: no column looks like path loss, path gain or received power "
-            f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
-            f"{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
+            f"{table.source}: no column appears to contain path loss, path gain or received power "
+            f"({', '.join(map(str, table.frame))}); name the column path_loss_db, path_gain_db or "
+            f"rsrp_dbm{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
         )
     # The order is losses, gains, powers of reference signals, other powers in decibels, other powers without a unit.
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]
     median = float(np.nanmedian(without_codes(table.frame[name])))
-    reason = f"its name, and values of about {median:.0f}"
+    reason = f"by its name and values of about {median:.0f}"
     if quantity == "path_loss" and median < 0:
-        quantity, reason = "path_gain", f"named a loss, but values of about {median:.0f} mean a gain"
+        quantity, reason = "path_gain", f"named as a loss, but values of about {median:.0f} indicate a gain"
     elif quantity == "path_gain" and median > 0:
-        quantity, reason = "path_loss", f"named a gain, but values of about {median:.0f} mean a loss"
+        quantity, reason = "path_loss", f"named as a gain, but values of about {median:.0f} indicate a loss"
     others = [candidate[3] for candidate in candidates[1:]]
     return ValueColumn(name, quantity, reason + (f"; not {', '.join(others)}" if others else ""))
 
@@ -329,7 +332,7 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
 
 
 def find_length_unit(names: Iterable[str]) -> float:
-    """The unit of length that column names state [m]; 1 if they state none.
+    """The unit of length that column names state [m]; 1 if no name states a unit.
 
     Raises:
         InputError: The names state different units.
@@ -342,12 +345,12 @@ def find_length_unit(names: Iterable[str]) -> float:
     units = {next(iter(marks)) for marks in stated.values() if len(marks) == 1}
     if len({LENGTH_UNITS.get(unit, 1.0) for unit in units}) > 1:
         listed = ", ".join(name for name, marks in stated.items() if marks)
-        raise InputError(f"positions are in different units ({listed}); give all in metres")
+        raise InputError(f"positions are in different units ({listed}); give all positions in metres")
     return LENGTH_UNITS.get(next(iter(units), "m"), 1.0)
 
 
 def find_frequency_unit(name: str, default: str = "hz") -> float:
-    """The unit of carrier frequency that a column's name states, in hertz; `default` if it states none.
+    """The unit of carrier frequency that a column name states, in hertz; `default` if the name states no unit.
 
     Example:
         >>> find_frequency_unit("Downlink [MHz]"), find_frequency_unit("carrier")
@@ -359,8 +362,8 @@ def find_frequency_unit(name: str, default: str = "hz") -> float:
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
     """Find the column of carrier frequencies, and the frequency of each row [Hz]; None without such a column.
 
-    The name contains a word for frequency, or else a unit of frequency. The unit is taken from the name, or else
-    inferred from the magnitude of the values.
+    The column name contains a word for frequency or a unit of frequency. The unit is read from the name if possible,
+    and otherwise inferred from the magnitude of the values.
 
     Example:
         >>> find_frequency(pd.DataFrame({"BW [MHz]": [20.0], "Frq [MHz]": [763.0]}))
@@ -384,7 +387,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def find_time(frame: pd.DataFrame) -> str | None:
-    """Name of the first column whose name suggests times, or None."""
+    """Name of the first column with a name that indicates times, or None."""
     return _first([str(name) for name in frame], "time")
 
 
@@ -394,7 +397,7 @@ def find_distance(frame: pd.DataFrame) -> str | None:
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees; in some tables, columns named longitude and latitude are in metres."""
+    """Whether coordinates can be degrees. In some tables, columns named longitude and latitude are in metres."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 

@@ -1,4 +1,4 @@
-"""Text tables as loggers and spreadsheets write them: encoding, separator, header, units, placeholders."""
+"""Reading of text tables written by loggers and spreadsheets: encoding, separator, header, units, placeholders."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
 """Extensions of text tables."""
 
 PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
-"""Texts that stand for a missing number in a column of numbers."""
+"""Texts that represent a missing number in a column of numbers."""
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
@@ -31,7 +31,7 @@ UNITS: Final = frozenset({
     "\u03bcs", "ns", "min", "h", "%", "v", "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string",
     "text", "int", "float",
 })  # fmt: skip
-"""Units that a row of units below the header may contain, in lower case."""
+"""Units that a row of units below the header can contain, in lower case."""
 
 _HEAD: Final = 64  # number of records from which the layout of a file is detected
 
@@ -41,10 +41,10 @@ class _Layout:
     """The layout of a table in a text.
 
     Attributes:
-        separator: Column separator; a space stands for any white space.
+        separator: Column separator; a space represents any white space.
         skipped: Number of lines above the header.
         units: Unit of each column, from a row of units below the header; empty without such a row.
-        unit_lines: First line of the row of units, and the line after its end, relative to the header's first line.
+        unit_lines: First line of the row of units and the line after its end, relative to the first line of the header.
     """
 
     separator: str
@@ -57,7 +57,7 @@ def read_text(path: Path) -> str:
     """Read the text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
 
     Raises:
-        InputError: The file cannot be read, or contains bytes that are not text.
+        InputError: The file cannot be read or contains bytes that are not text.
     """
     try:
         raw = path.read_bytes()
@@ -81,7 +81,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
     r"""Read the rows of a table in a text, without blank lines.
 
     Lines above the header are skipped if they have a different number of cells or mostly empty cells. Units in a row
-    below the header are appended to the column names. Columns of numbers may contain placeholders (`PLACEHOLDERS`), and
+    below the header are appended to the column names. Columns of numbers can contain placeholders (`PLACEHOLDERS`) and
     the same decibel unit after every number.
 
     Args:
@@ -125,10 +125,10 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
         # pandas reports Ctrl-C during reading as "source failed", which has no other cause when reading from memory.
         if "source failed" in str(error):
             raise KeyboardInterrupt from None
-        raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check its quotes") from None
+        raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check the quotes") from None
     if len(frame) != len(rows):
         raise InputError(
-            f"{path}: the file has {len(rows)} rows, but {len(frame)} can be read; check its quotes"
+            f"{path}: the file has {len(rows)} rows, but only {len(frame)} can be read; check the quotes"
         )
     units = layout.units or [""] * len(frame.columns)
     frame = frame.set_axis(list(map(_with_unit, frame, units)), axis=1)
@@ -139,7 +139,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """Find the first line that can be a header of rows of its width, and the separator that gives the most columns."""
+    """Find the first line that can be the header of the rows below, and the separator with the most columns."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
@@ -172,7 +172,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Cells of the first records that are not blank, each record with its first line and the line after its end."""
+    """Cells of the first non-blank records, each with the first line of the record and the line after its end."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -187,7 +187,7 @@ def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]
 
 
 def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Units of the columns, and the lines where their row begins and ends; empty and (0, 0) without a row of units."""
+    """Units of the columns, and the first line and end of the row of units; empty and (0, 0) without such a row."""
     if len(records) < 3:
         return (), (0, 0)
     (header, *_), (cells, start, end), (below, *_) = records[:3]
@@ -214,7 +214,7 @@ def _with_unit(name: object, unit: str) -> str:
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
-    """Convert texts to numbers if all are numbers, numbers with the same decibel unit, or placeholders.
+    """Convert texts to numbers if every text is a number, a number with the same decibel unit, or a placeholder.
 
     Leading and trailing white space is removed from other texts.
     """
@@ -236,7 +236,7 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
     """The decimal mark of the numbers in a CSV text.
 
     Raises:
-        InputError: The decimal mark is not the same in all numbers, or may separate thousands.
+        InputError: The decimal mark is not the same in all numbers, or could be a separator of thousands.
     """
     lines: dict[str, int] = {}
     # Cells such as 1,234 by column, and columns with whole numbers below 1000.
@@ -263,14 +263,14 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
     if "," in lines and not is_clear and (both := sorted(whole & set(unclear))):
         line, cell = unclear[both[0]]
         raise InputError(
-            f"{path}, row {line}: {cell!r} can mean {cell.replace(',', '.')} or {cell.replace(',', '')}, because "
-            "its column also has numbers without a comma; remove separators of thousands, or write decimal points"
+            f"{path}, row {line}: {cell!r} can mean {cell.replace(',', '.')} or {cell.replace(',', '')}, because its "
+            "column also contains numbers without a comma; remove separators of thousands, or write decimal points"
         )
     return "," if "," in lines else "."
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Header, and line number of each row, of a CSV text; faults that pandas would silently repair are refused.
+    """Header of a CSV text and line number of each row; errors that pandas would silently correct are refused.
 
     The third result is whether every row ends with an additional empty cell.
 
@@ -291,16 +291,18 @@ def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], 
                 header = cells
                 if all(map(_is_number, filter(str.strip, header))):
                     raise InputError(
-                        f"{path}, row {line}: contains numbers; add a line with the column names above it"
+                        f"{path}, row {line}: contains numbers; insert a line with the column names above this row"
                     )
                 names = Counter(name.strip() for name in header if name.strip())
                 if repeated := [name for name, count in names.items() if count > 1]:
-                    raise InputError(f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one")
+                    raise InputError(
+                        f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one of the columns"
+                    )
                 continue
             ends.add(len(cells) - len(header))
             if len(ends) > 1 or ends - {0, 1} or (1 in ends and cells[-1].strip()):
                 raise InputError(
-                    f"{path}, row {line}: {len(cells)} cells, the header has {len(header)}; correct the row"
+                    f"{path}, row {line}: {len(cells)} cells, but the header has {len(header)}; correct the row"
                 )
             lines.append(line)
     except csv.Error as error:

@@ -1,8 +1,8 @@
-"""Row filters: a small closed language over the columns of a table.
+"""Row filters: a small, closed expression language for the columns of a table.
 
-Python's parser reads a filter, and this module interprets the syntax tree on whole columns; nothing is passed to
-`eval`. Only the operators, functions and methods listed below exist: no attributes, no subscripts, no other calls.
-Precedence is as in pandas queries: ``&`` and ``|`` mean ``and`` and ``or``, with the same low precedence.
+Filters are parsed by Python, and this module evaluates the syntax tree on whole columns without `eval`. Only the
+operators, functions and methods listed below are allowed. Attributes, subscripts and other calls are errors. As in
+pandas queries, ``&`` and ``|`` are equivalent to ``and`` and ``or`` and have the same low precedence.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MAX_PATTERN_LENGTH: Final = 200
 """Largest number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column that is searched for a repetition; this search takes 2 to 5 s."""
+"""Largest sum of squared text lengths in a column for a pattern with a repetition; such a search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -82,7 +82,7 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse to compare a column of texts with nothing but numbers, or one of numbers with nothing but texts."""
+    """Refuse comparisons of a column of texts with numbers only, or of a column of numbers with texts only."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
@@ -134,7 +134,7 @@ def _check_types(kind: type, **values: Any) -> None:
 
 
 def _affix(pat: Any, na: Any) -> Any:
-    """The checked prefix or suffix of a text, or a tuple of them."""
+    """The checked prefix or suffix of a text, or a tuple of prefixes or suffixes."""
     _check_types(bool, na=na)
     for text in pat if isinstance(pat, tuple) else (pat,):
         _check_types(str, pat=text)
@@ -152,7 +152,7 @@ _REPETITION: Final = re.compile(rf"(?:{_CLASS}|\\.|[^*+?])*+[*+?]")
 
 
 def _check_pattern(pattern: str, column: pd.Series) -> None:
-    """Refuse a regular expression that is malformed, or whose search in a column might take too long."""
+    """Refuse a regular expression that is malformed or could take too long to search for in a column."""
     if len(pattern) > MAX_PATTERN_LENGTH:
         raise InputError(f"{len(pattern)} characters, must be at most {MAX_PATTERN_LENGTH}; shorten it")
     try:
@@ -163,8 +163,8 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
         ) from None
     if not _PATTERN.fullmatch(pattern):
         raise InputError(
-            "only characters, classes, ^, $, | and one *, + or ? per alternative are allowed; set regex=False to "
-            "search for a plain text"
+            "a pattern can contain only characters, classes, ^, $, | and one *, + or ? per alternative; set "
+            "regex=False to search for a plain text"
         )
     # A match attempt at each position may run to the end of the text, so the cost is quadratic in its length.
     if _REPETITION.match(pattern):
@@ -174,11 +174,11 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
-    """Mask [rows] of the rows that pass a filter; missing values pass only the comparisons `!=` and `not in`.
+    """Mask [rows] of the rows that pass a filter. Missing values pass only the comparisons `!=` and `not in`.
 
     Raises:
-        InputError: The filter is malformed or too large, uses an unknown column or a construct that is not allowed, or
-            does not give one truth value per row. The message quotes the faulty part, but not the filter's origin.
+        InputError: The filter is malformed or too large, uses an unknown column or a forbidden construct, or does not
+            result in one truth value per row. The message quotes the faulty part, but not the origin of the filter.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -204,7 +204,7 @@ _TOKENS: Final = re.compile(
 
 
 def _as_python(expression: str) -> tuple[str, dict[str, str]]:
-    """A filter as a Python expression, and the column that each replacement of a backticked name stands for."""
+    """A filter as a Python expression, and the column that each replacement of a backticked name represents."""
     stem = "quoted"
     while stem in expression:
         stem += "_"
@@ -221,14 +221,15 @@ def _as_python(expression: str) -> tuple[str, dict[str, str]]:
 
 
 def _parse(code: str, columns: Iterable[object]) -> ast.expr:
-    """The syntax tree of an expression; refuses an expression that is malformed or too large."""
+    """The syntax tree of an expression. A malformed or excessively large expression is refused."""
     try:
         tree = ast.parse(code, mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         fault = getattr(error, "msg", None) or str(error) or "too deep"
         names = shortened(", ".join(map(str, columns)), 200)
         raise InputError(
-            f"not a valid filter ({fault}); compare as in \"x < 5 and set == 'LOS'\"; the columns are {names}"
+            f"not a valid filter ({fault}); write a comparison such as \"x < 5 and set == 'LOS'\"; the columns are "
+            f"{names}"
         ) from None
     parts = 0
     level: list[ast.AST] = [tree]
@@ -236,10 +237,12 @@ def _parse(code: str, columns: Iterable[object]) -> ast.expr:
         parts += len(level)
         level = [child for node in level for child in ast.iter_child_nodes(node)]
         if parts > MAX_PARTS:
-            raise InputError(f"more than {MAX_PARTS} parts; shorten it, or add a column to filter by")
+            raise InputError(
+                f"more than {MAX_PARTS} parts; shorten the filter, or add a column to the table for filtering"
+            )
         if not level:
             return tree
-    raise InputError(f"nested more than {MAX_DEPTH} deep; shorten it")
+    raise InputError(f"more than {MAX_DEPTH} nested levels; shorten the filter")
 
 
 class _Interpreter:
@@ -249,7 +252,7 @@ class _Interpreter:
         self._frame, self._code, self._backticked = frame, code, backticked
 
     def value(self, node: ast.expr) -> _Value:
-        """The value of a part: a column, or one number, text or truth value."""
+        """The value of a part of the filter: a column, or a single number, text or truth value."""
         try:
             match node:
                 case ast.Name():
@@ -283,7 +286,7 @@ class _Interpreter:
         )
 
     def _refusal(self, node: ast.AST, fault: str) -> InputError:
-        """The error for a part, which the message quotes as written in the filter."""
+        """The error for a part of the filter. The message quotes the part as written."""
         piece = ast.get_source_segment(self._code, node) or type(node).__name__
         for name, column in self._backticked.items():
             piece = piece.replace(name, f"`{column}`")
@@ -299,7 +302,7 @@ class _Interpreter:
             raise InputError(f"no column {shortened(name)!r}; {did_you_mean(name, map(str, self._frame))}")
         column = self._frame[name]
         if not isinstance(column, pd.Series):
-            raise InputError(f"column {name!r} appears several times in the table; rename one")
+            raise InputError(f"column {name!r} appears several times in the table; rename one of them")
         return column
 
     def _constant(self, node: ast.Constant) -> bool | int | float | str:
@@ -307,7 +310,7 @@ class _Interpreter:
             remedy = "use isna() or notna()" if node.value is None else "use a number, a text, True or False"
             raise self._refusal(node, f"not allowed in a filter; {remedy}")
         if isinstance(node.value, int) and abs(node.value) > _MAX_INTEGER:
-            raise self._refusal(node, f"too large a number, must be at most {_MAX_INTEGER}; correct it")
+            raise self._refusal(node, f"the number is too large; it must be at most {_MAX_INTEGER}")
         return node.value
 
     def _truth(self, node: ast.expr) -> pd.Series | bool:
@@ -316,7 +319,8 @@ class _Interpreter:
             return value
         raise self._refusal(
             node,
-            "must be true or false to be combined by and, or, not; compare it, or put comparisons in parentheses",
+            "must be true or false to be combined with and, or, not; write a comparison, or put comparisons in "
+            "parentheses",
         )
 
     def _number(self, node: ast.expr) -> pd.Series | int | float:
@@ -326,12 +330,12 @@ class _Interpreter:
                 return value
         elif isinstance(value, int | float) and not isinstance(value, bool):
             return value
-        raise self._refusal(node, "must be a number, or a column of numbers, for arithmetic")
+        raise self._refusal(node, "must be a number or a column of numbers for arithmetic")
 
     def _column(self, node: ast.expr) -> pd.Series:
         value = self.value(node)
         if not isinstance(value, pd.Series):
-            raise self._refusal(node, "must be a column, or calculated from one")
+            raise self._refusal(node, "must be a column or an expression with a column")
         return value
 
     def _literals(self, node: ast.List | ast.Tuple) -> list[bool | int | float | str | None]:
@@ -366,7 +370,7 @@ class _Interpreter:
         several = isinstance(right, list | tuple)
         if kind in (ast.In, ast.NotIn) or (several and kind in (ast.Eq, ast.NotEq)):
             if not isinstance(left, pd.Series):
-                raise self._refusal(sides[0], "must be a column, or calculated from one")
+                raise self._refusal(sides[0], "must be a column or an expression with a column")
             choices = [right] if isinstance(right, str) else right
             if not isinstance(choices, list | tuple | pd.Series):
                 raise self._refusal(sides[1], "must be a list of values, as in ['A', 'B']")
@@ -374,10 +378,10 @@ class _Interpreter:
             contained = left.isin(choices)
             return contained if kind in (ast.In, ast.Eq) else ~contained
         if kind not in COMPARISONS:
-            raise self._refusal(node, "is and is not are not allowed; use ==, != or isna()")
+            raise self._refusal(node, "'is' and 'is not' are not allowed; use ==, != or isna()")
         for side, value in zip(sides, values, strict=True):
             if isinstance(value, list | tuple):
-                raise self._refusal(side, "a list of values can only be compared with in, not in, == and !=")
+                raise self._refusal(side, "a list of values can be compared only with in, not in, == and !=")
         if kind in (ast.Eq, ast.NotEq):
             self._check_equality(node, left, [right])
             self._check_equality(node, right, [left])
@@ -405,24 +409,24 @@ class _Interpreter:
         # both.
         result = operation(left, right)
         if _overflows(operation, left, right, result):
-            raise self._refusal(node, "the result is too large a number; correct it")
+            raise self._refusal(node, "the result is too large; correct the expression")
         return result
 
     def _call(self, node: ast.Call) -> _Value:
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if not (ast.get_source_segment(self._code, node.func) or "").endswith(name):
             # The name contains letters that Python normalizes.
-            raise self._refusal(node.func, f"write the method in plain letters, {name!r}")
+            raise self._refusal(node.func, f"write the method in ASCII letters, as {name!r}")
         match node.func:
             case ast.Name():
                 function = _allowed(name, FUNCTIONS)
                 if node.keywords or len(node.args) != function.nin:
-                    raise self._refusal(node, f"takes {function.nin} number(s), nothing else")
+                    raise self._refusal(node, f"needs exactly {function.nin} number(s)")
                 return function(*(_as_floats(self._number(argument)) for argument in node.args))
             case ast.Attribute(value=ast.Attribute(value=owner, attr="str")):
                 method, column = _allowed(name, TEXT_METHODS), self._column(owner)
                 if not (pd.api.types.is_string_dtype(column.dtype) or column.dtype == object):
-                    raise self._refusal(owner, f"must be a column of texts; leave .str.{name}() out")
+                    raise self._refusal(owner, f"must be a column of texts; remove .str.{name}()")
                 return self._call_method(node, name, method, column)
             case ast.Attribute(value=owner):
                 method = _allowed(name, METHODS)

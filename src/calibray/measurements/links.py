@@ -16,10 +16,10 @@ from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance between transmitter and receiver below which they count as coincident and have no path loss [m]."""
+"""Distance below which transmitter and receiver are treated as coincident and path loss is undefined [m]."""
 
 FEW: Final = 8
-"""Smallest number of links from whose errors a trend, a noise model or a prediction error is estimated."""
+"""Smallest number of links for estimating a trend, a noise model or a prediction error."""
 
 MAX_CARRIERS: Final = 32
 """Largest number of carrier frequencies; a column with more values probably contains a different quantity."""
@@ -27,23 +27,25 @@ MAX_CARRIERS: Final = 32
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements:
-    """Links, each with one measured path loss; arrays are copies and read-only.
+    """Links, each with one measured path loss. The arrays are read-only copies.
 
     Attributes:
         tx: Transmitter positions [links, 3], [m].
         rx: Receiver positions [links, 3], [m].
         path_loss_db: Measured path loss [links], [dB]; all NaN for links without measured values.
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
-        group: Label [links] of each link's group, or None.
+        group: Group label of each link [links], or None.
         frequency: Carrier frequency of each link [links], [Hz]; None if all links have the carrier of the study.
         limit_db: Largest measurable path loss [links], [dB]; None if unknown.
-        censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
-            no link is censored.
-        table: The rows of the source table, used by filters and messages; one empty row per link if not given.
+        censored: Mask [links] of the links below the noise floor, which have a path loss of at least `path_loss_db`;
+            None if no link is censored.
+        table: The rows of the source table, used by filters and messages. If not given, there is one empty row per
+            link.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
-            positive, a carrier frequency is implausible, there are too many, or only some path losses are finite.
+            positive, a carrier frequency is implausible, there are too many carriers, or only some path losses are
+            finite.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -67,7 +69,7 @@ class Measurements:
         count = np.shape(self.path_loss_db)[0] if np.ndim(self.path_loss_db) == 1 else 0
         if count < 1:
             raise InputError(
-                f"path_loss_db: shape {np.shape(self.path_loss_db)}, must be [links], one or more"
+                f"path_loss_db: shape {np.shape(self.path_loss_db)}, must be [links] with at least one link"
             )
         if self.weight is None:
             object.__setattr__(self, "weight", np.ones(count))
@@ -106,7 +108,7 @@ class Measurements:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows of the source table, one per link, with all its columns."""
+        """The rows of the source table, one per link, with all columns."""
         return self.table.frame
 
     @property
@@ -121,7 +123,7 @@ class Measurements:
 
     @property
     def prepared(self) -> dict[str, int]:
-        """Changes to the table's rows, such as rows left out or averaged, each with the number of affected rows."""
+        """Changes to the rows of the table, such as exclusion or averaging, each with the number of affected rows."""
         return dict(self.table.changes)
 
     @property
@@ -136,12 +138,12 @@ class Measurements:
 
     @property
     def group_names(self) -> tuple[str, ...]:
-        """The names of the groups, sorted; a single empty name if the links have no groups."""
+        """The sorted names of the groups; a single empty name if the links have no groups."""
         return ("",) if self.group is None else tuple(map(str, np.unique(self.group)))
 
     @property
     def group_index(self) -> NDArray[np.int64]:
-        """The index [links] of each link's group in `group_names`."""
+        """The index in `group_names` of the group of each link [links]."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
         # Every group is among the sorted names, so the insertion point is its index.
@@ -149,7 +151,7 @@ class Measurements:
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """Carrier frequencies [Hz], ascending, each with the indices of its links; empty if `frequency` is None."""
+        """Ascending carrier frequencies [Hz], each with the indices of its links; empty if `frequency` is None."""
         if self.frequency is None:
             return ()
         return tuple(
@@ -158,7 +160,7 @@ class Measurements:
         )
 
     def select(self, mask: ArrayLike) -> Measurements:
-        """Select the links where a mask [links] is true.
+        """Select the links for which a mask [links] is true.
 
         Raises:
             InputError: The mask does not have one truth value per link, or selects no link.
@@ -169,7 +171,7 @@ class Measurements:
                 f"mask: {chosen.dtype} of shape {chosen.shape}, must be bool of shape ({len(self)},)"
             )
         if not chosen.any():
-            raise InputError(f"{self.source}: the selection leaves none of {len(self)} links")
+            raise InputError(f"{self.source}: the selection contains none of the {len(self)} links")
         return Measurements(
             tx=self.tx[chosen],
             rx=self.rx[chosen],
@@ -183,7 +185,7 @@ class Measurements:
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that pass a filter on the source table's columns.
+        """Mask [links] of the links that pass a filter on the columns of the source table.
 
         Raises:
             InputError: The filter is not valid (see `SourceTable.where`).
@@ -191,7 +193,7 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that a filter holds out: at least one, but not all.
+        """Mask [links] of the links that a filter holds out; at least one link, but not all.
 
         Raises:
             InputError: The filter is not valid, or holds out no link or every link.
@@ -206,7 +208,7 @@ class Measurements:
 
 
 def _as_array(name: str, values: ArrayLike, dtype: type) -> NDArray[np.generic]:
-    """A copy of the values as an array, with NaN for masked numbers."""
+    """A copy of the values as an array, with NaN in place of masked numbers."""
     try:
         if isinstance(values, np.ma.MaskedArray) and dtype is np.float64:
             return np.where(np.ma.getmaskarray(values), np.nan, np.ma.getdata(values).astype(dtype))
@@ -222,13 +224,16 @@ def _check_links(links: Measurements) -> None:
     checks = (
         (~np.isfinite(links.tx).all(axis=1), "the transmitter's position is not finite; correct it"),
         (~np.isfinite(links.rx).all(axis=1), "the receiver's position is not finite; correct it"),
-        (links.distance < MIN_DISTANCE, "transmitter and receiver are at the same point; move or remove one"),
+        (
+            links.distance < MIN_DISTANCE,
+            "transmitter and receiver are at the same point; correct the positions or remove the row",
+        ),
         (~(links.weight > 0), "the weight must be greater than 0; remove the row"),
         (np.isinf(links.weight), "the weight must be finite; correct it"),
         (np.isinf(links.path_loss_db), "the path loss is infinite; remove the row"),
         (
             np.isfinite(links.path_loss_db) != links.measured,
-            "only some links have a path loss; give all or none",
+            "only some links have a path loss; give a value for all links or for none",
         ),
     )
     for wrong, fault in checks:
@@ -246,18 +251,18 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
     if (outside := ~((frequency >= lowest) & (frequency <= highest))).any():
         first = int(np.flatnonzero(outside)[0])
         raise InputError(
-            f"{links.source}, row {links.row[first]}: the frequency {frequency[first]:g} must be in {lowest:g} to "
-            f"{highest:g} Hz ({outside.sum()} of {len(links)} rows); write 28.5 GHz as 28.5e9"
+            f"{links.source}, row {links.row[first]}: the frequency {frequency[first]:g} must be between {lowest:g} "
+            f"and {highest:g} Hz ({outside.sum()} of {len(links)} rows); write 28.5 GHz as 28.5e9"
         )
     if (count := len(np.unique(frequency))) > MAX_CARRIERS:
         raise InputError(
-            f"{links.source}: {count} different frequencies, must be at most {MAX_CARRIERS}; give the "
-            "carrier frequency of each link, not a frequency within the measured band"
+            f"{links.source}: {count} different frequencies, but at most {MAX_CARRIERS} are allowed; give the carrier "
+            "frequency of each link, not a frequency within the measured band"
         )
 
 
 def _summary(links: Measurements) -> Table:
-    """Summary table of the links: source, number, and ranges of values."""
+    """Summary table of the links, with source, number and ranges of values."""
     kind = "measured" if links.measured else "unmeasured"
     rows = [("number", f"{len(links):,} {kind}"), ("distance", _range(links.distance, "m"))]
     if links.measured:

@@ -1,8 +1,8 @@
-"""Observables of links from measured multipath components: the delay, power and angles of each path of each link.
+"""Observables of links from measured multipath components, which are the delays, powers and angles of paths.
 
-Each observable is the statistic that the model computes, but components outside the receiver's dynamic range are cut
-off sharply. If a link was measured several times, for example with a rotated array, the snapshots are averaged.
-Impulse responses are converted to components, which are the samples above a given threshold.
+Each observable is the same statistic as in the model, except that components outside the dynamic range of the receiver
+are cut off sharply. If a link was measured several times, for example with a rotated array, the snapshots are averaged.
+Impulse responses are converted to components: the samples above a threshold.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ ANGLE: Final = {
 END: Final = {"departure": r"(^|_)([aze]od|departure|tx)(_|$)", "arrival": r"(^|_)([aze]oa|arrival|rx)(_|$)"}
 SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_|$)"
 ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
-"""Kinds of statistics that need angles."""
+"""Kinds of statistics that are computed from angles."""
 
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 RADIANS: Final = frozenset({"rad", "radian", "radians"})
-"""Words in a column's name that show that its angles are not in degrees."""
+"""Words in a column name that indicate angles in radians instead of degrees."""
 
 LONGEST: Final = 0.01
-"""Largest plausible delay [s], in which light travels 3,000 km."""
+"""Largest plausible delay [s]; light travels 3,000 km in this time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Multipath:
     """Measured multipath components of links.
 
     Attributes:
-        link: Label of each component's link [n].
+        link: Label of the link of each component [n].
         snapshot: Label of the snapshot in which each component was measured [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
@@ -71,18 +71,18 @@ class Multipath:
 def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multipath:
     """Read a table with one row per multipath component.
 
-    The columns are recognized by their names: a delay (`delay_ns`), a path loss, path gain or power [dB]
-    (`path_loss_db`), and, if present, an azimuth, an elevation, and the number of the rotation or snapshot. An angle
-    is used for both ends unless the column's name states one of them (`aoa_deg`, `azimuth_tx`).
+    The columns are recognized by name: a delay (`delay_ns`), a path loss, path gain or power [dB] (`path_loss_db`),
+    and, if present, an azimuth, an elevation, and the number of the rotation or snapshot. An angle is used for both
+    ends unless the column name states an end (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
-        link: Column of the links' labels.
+        link: Column of the link labels.
         compass: Whether azimuths are compass bearings, clockwise from north.
 
     Raises:
-        InputError: The table cannot be read, or has no column of links, delays or powers; or delays or powers do not
-            match the unit or sign that their names imply.
+        InputError: The table cannot be read, or has no column of links, delays or powers. Delays or powers do not match
+            the unit or sign that the column names imply.
     """
     table = read_table(path)
     # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
@@ -102,22 +102,22 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         missing = (
             "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
         )
-        raise InputError(f"{path}: no column for a {missing}; its columns are {', '.join(names)}")
+        raise InputError(f"{path}: no column with a {missing}; the columns are {', '.join(names)}")
     labels = table.labels(link)
     unit = next((unit for unit in SECONDS if unit in words(delay)), "s")
     seconds = table.numbers(delay) * SECONDS[unit]
     if seconds.max() > LONGEST:
         raise InputError(
-            f"{path}: column {delay!r} has a delay of {seconds.max():g} s, must be at most {LONGEST:g} s; state its "
-            "unit in its name, such as delay_ns"
+            f"{path}: column {delay!r} has a delay of {seconds.max():g} s, must be at most {LONGEST:g} s; state the "
+            "unit in the column name, such as delay_ns"
         )
     level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", names[power]) is not None
     median, is_level = float(np.median(level_db)), matches(power, "decibel") and "gain" not in power.lower()
     # Received power in decibels can be positive if the receiver is not calibrated.
     if (median < 0) if is_loss else (median > 0 and not is_level):
         raise InputError(
-            f"{path}: column {power!r} has values of about {median:g} dB; losses must be positive, gains and "
-            "powers negative: name it path_loss_db or path_gain_db"
+            f"{path}: column {power!r} has values of about {median:g} dB; losses must be positive, and gains and "
+            "powers negative; name the column path_loss_db or path_gain_db"
         )
 
     angles = {}
@@ -149,13 +149,13 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
-    """Compute a statistic of each link in SI units, averaged over the link's snapshots, by the link's label.
+    """Compute a statistic of each link in SI units, averaged over the snapshots of the link, by link label.
 
-    Snapshots with a single component have no K-factor and are excluded from its mean. Links with no component that the
-    receiver detects are left out. The components already reflect the bandwidth of the receiver.
+    Snapshots with a single component have no K-factor and are excluded from the mean. Links without a component that
+    the receiver detects are excluded. The components already reflect the bandwidth of the receiver.
 
     Raises:
-        InputError: The statistic needs angles that were not measured.
+        InputError: The statistic requires angles that were not measured.
 
     Example:
         >>> paths = Multipath(np.array(["a", "a"]), np.array(["", ""]), np.array([1e-7, 2e-7]), np.zeros(2))
@@ -168,8 +168,8 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
         angle = multipath.angles.get((plane, end))
         if angle is None:
             raise InputError(
-                f"{statistic.kind} needs angles, which are missing or in several columns; give one column, "
-                f"such as {plane}_{end}_deg"
+                f"{statistic.kind} needs angles, which are missing or in several columns; give a single column, such "
+                f"as {plane}_{end}_deg"
             )
     snapshots: dict[str, list[float]] = {}
     keys = pd.DataFrame({"link": multipath.link, "snapshot": multipath.snapshot})
@@ -229,35 +229,35 @@ MOST_BYTES: Final = 4 << 30
 """Largest total size of the arrays in a file [bytes]."""
 
 DELAYS: Final = ("delay", "delays", "tau", "time", "t")
-"""Names under which a file may contain the delays of the samples [s]."""
+"""Names of the array of sample delays in a file [s]."""
 
 MARGIN_DB: Final = 10.0
-"""A sample counts as signal if it exceeds the mean noise power by this margin [dB]. The power of noise samples is
-exponentially distributed, so one noise sample in 22,000 does so too."""
+"""Margin above the mean noise power at which a sample is treated as signal [dB]. The power of noise samples is
+exponentially distributed, so one noise sample in 22,000 exceeds this margin."""
 
 
 def read_impulse_responses(
     source: str | Path, labels: list[str], sample_rate: float | None = None, margin_db: float = MARGIN_DB
 ) -> Multipath:
-    """Read impulse responses, and keep the samples that exceed the noise of each response.
+    """Read impulse responses and keep the samples of each response that exceed the noise.
 
-    Files may be in the format of NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) or HDF5.
+    Files can be NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) or HDF5 files.
 
     The mean noise power of a response is estimated as the median power of its samples divided by ln 2, because noise
     powers are exponentially distributed. Most samples of a response must therefore be noise.
 
     Args:
-        source: A file with one response per link in the order of the labels, [links, samples] or
-            [links, snapshots, samples]; or a folder with one file per link, [samples] or [snapshots, samples].
+        source: A file with one response per link in the order of the labels, [links, samples] or [links, snapshots,
+            samples]. Alternatively, a folder with one file per link, [samples] or [snapshots, samples].
         labels: Labels of the links.
         sample_rate: Samples per second [Hz]; None if the files state delays [s].
-        margin_db: A sample counts as a component if it exceeds the mean noise power by this margin [dB].
+        margin_db: Margin above the mean noise power at which a sample becomes a component [dB].
 
     Returns:
-        The samples above the threshold, with their powers, as components.
+        The samples above the threshold as components, with their powers.
 
     Raises:
-        InputError: A file cannot be read, or its array does not match the links.
+        InputError: A file cannot be read, or the array does not match the links.
     """
     source = Path(source)
     parts = []
@@ -265,7 +265,7 @@ def read_impulse_responses(
         files = {file.stem: file for file in sorted(source.iterdir()) if file.suffix.lower() in ENDINGS}
         known = [label for label in labels if label in files]
         if not known:
-            raise InputError(f"{source}: no file is named like a link, such as {labels[0]}.npz")
+            raise InputError(f"{source}: no file has the name of a link, such as {labels[0]}.npz")
         for label in known:
             response, delay = _read(files[label], sample_rate)
             parts.append(_above_noise(label, np.atleast_2d(response), delay, margin_db))
@@ -275,7 +275,7 @@ def read_impulse_responses(
         response = response[None] if response.ndim == 1 and len(labels) == 1 else response
         if len(response) != len(labels) or response.ndim not in (2, 3):
             raise InputError(
-                f"{source}: the array has shape {response.shape}, must have one row for each of {len(labels)} links"
+                f"{source}: the array has shape {response.shape}, but must have one row for each of {len(labels)} links"
             )
         for label, own in zip(labels, response, strict=True):
             parts.append(_above_noise(label, np.atleast_2d(own), delay, margin_db))
@@ -286,7 +286,7 @@ def read_impulse_responses(
 def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
-    """Link, snapshot, delay and level of those samples of a link's responses [snapshots, samples] that exceed noise."""
+    """Link, snapshot, delay and level of the samples above the noise in a link's responses [snapshots, samples]."""
     # Squares of small integer types, such as converter samples, would wrap around.
     power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
@@ -308,12 +308,14 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
     largest = {name: array for name, array in numeric.items() if array.size == size}
     if len(largest) > 1:
         raise InputError(
-            f"{file}: contains several arrays of {size} numbers ({shortened(', '.join(largest))}); keep only "
-            f"one, of complex numbers or amplitudes, and name the delays {DELAYS[0]!r}"
+            f"{file}: contains several arrays of {size} numbers ({shortened(', '.join(largest))}); keep only one "
+            f"array, of complex numbers or amplitudes, and name the array of delays {DELAYS[0]!r}"
         )
     ((name, response),) = largest.items()
     if response.dtype.kind != "c" and (response <= 0).all():
-        raise InputError(f"{file}: {shortened(name)!r} is in decibels; give complex numbers or amplitudes")
+        raise InputError(
+            f"{file}: {shortened(name)!r} appears to be in decibels; give complex numbers or amplitudes"
+        )
     # Remove axes of length 1, such as the axis of a single transmit or receive antenna.
     response = np.squeeze(response) if response.ndim > 3 else response
     if not np.isfinite(response).all():
@@ -329,8 +331,8 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
         delay = np.arange(count) / sample_rate
     if not delay.max(initial=0.0) <= LONGEST:
         raise InputError(
-            f"{file}: has a delay of {delay.max():g} s, must be at most {LONGEST:g} s; give delays in seconds, or the "
-            "sample rate in Hz"
+            f"{file}: has a delay of {delay.max():g} s, but the largest allowed delay is {LONGEST:g} s; give delays in "
+            "seconds, or the sample rate in Hz"
         )
     return response, delay
 
@@ -361,7 +363,7 @@ def _arrays(file: Path) -> dict[str, NDArray[Any]]:
 
 
 def _hdf5_arrays(file: Path, reverse: bool) -> dict[str, NDArray[Any]]:
-    """The datasets at the root of an HDF5 file; MATLAB writes axes in reverse order, and complex numbers as pairs."""
+    """The datasets at the root of an HDF5 file. MATLAB writes axes in reverse order and complex numbers as pairs."""
     arrays = {}
     with h5py.File(file, "r") as content:
         datasets = {name: item for name in content if isinstance(item := content.get(name), h5py.Dataset)}
@@ -380,13 +382,13 @@ def _hdf5_arrays(file: Path, reverse: bool) -> dict[str, NDArray[Any]]:
 def _check_size(file: Path, size: int) -> None:
     if size > MOST_BYTES:
         raise InputError(
-            f"{file}: its arrays take {size / 2**30:.1f} GiB, must take at most 4; split the file"
+            f"{file}: the arrays take {size / 2**30:.1f} GiB, but at most 4 GiB are allowed; split the file"
         )
 
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Convert a library's errors to errors that name the file."""
+    """Convert errors of a library to errors that name the file."""
     try:
         yield
     except InputError:

@@ -1,4 +1,4 @@
-"""Observables of links in addition to path loss: measured statistics of a link's paths, and their units."""
+"""Observables of links in addition to path loss: measured statistics of the paths, and their units."""
 
 from __future__ import annotations
 
@@ -35,24 +35,25 @@ KINDS: Final = {
     DEPARTURE_SECTOR: "dB",
     ARRIVAL_SECTOR: "dB",
 }
-"""Kinds of observables, each with the unit of its values."""
+"""Kinds of observables and the units of their values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are times; measured times may contain a bias of the device."""
+"""Kinds that are times. Measured times can contain a bias of the device."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds that are fractions of a link's power in bins; each bin is a separate observable."""
+"""Kinds that are fractions of the power of a link in a bin. Each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
-"""Kinds whose measured values can be negative: values in decibels, and times from a clock with a bias."""
+"""Kinds with measured values that can be negative: values in decibels, and times from a clock with a bias."""
 
 SHARE_RANGE_DB: Final = 30.0
-"""Dynamic range of the fraction of power in a bin, unless a study states one [dB]."""
+"""Default dynamic range of the fraction of power in a bin [dB]."""
 
 ROUNDING: Final = 1e-12
-"""A delay [s] or azimuth [rad] counts as on a limit if it is this close, as with samples at multiples of 1 / bandwidth.
-This exceeds the rounding errors of differences of delays or azimuths, and is below the resolution of any receiver."""
+"""Tolerance within which a delay [s] or azimuth [rad] is at a limit, as for samples at multiples of 1 / bandwidth. The
+tolerance exceeds the rounding errors of differences of delays or azimuths, and is below the resolution of any
+receiver."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,13 @@ class Statistic:
 
     Attributes:
         kind: One of `KINDS`.
-        path: Path of a time of flight: "mean", "first" or "strongest".
-        dynamic_range_db: The receiver detects paths that are at most this far below the strongest path [dB]; None if it
-            detects all paths.
+        path: Path that determines a time of flight: "mean" (the mean over all paths), "first" or "strongest".
+        dynamic_range_db: Range below the strongest path in which the receiver detects paths [dB]; None if it detects
+            all paths.
         floor_db: Path gain below which the receiver detects no paths [dB]; None for no limit.
         window: Longest delay after the first path [s]; None for no limit.
         bandwidth: Bandwidth of the receiver [Hz]; None if the receiver resolves all paths.
-        edges: Edges of the bin of one of `PROFILES`: delays after the first path [s], or azimuths [rad].
+        edges: Edges of the bin, for a kind in `PROFILES`: delays after the first path [s] or azimuths [rad].
     """
 
     kind: str
@@ -80,20 +81,22 @@ class Statistic:
 
     @property
     def bin(self) -> tuple[float, float]:
-        """Edges of the bin, both reduced by `ROUNDING`; a value at the lower edge is inside, one at the upper is not.
+        """Edges of the bin, both reduced by `ROUNDING`.
+
+        A value at the lower edge is inside; a value at the upper edge is outside.
 
         Raises:
             ValueError: The statistic has no bin.
         """
         if self.edges is None:
-            raise ValueError(f"{self.kind}: needs edges, the ends of its bin")
+            raise ValueError(f"{self.kind}: needs the edges of the bin")
         low, high = self.edges
         return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
-        """Fractions of power in a bin [dB], plus a constant fraction at the lower end of the dynamic range.
+        """Fractions of power in a bin [dB], increased by a constant fraction at the lower end of the dynamic range.
 
-        An empty bin therefore has a finite value, both in the model and in measurements.
+        An empty bin therefore has a finite value both in the model and in the measurements.
 
         Example:
             >>> Statistic(DELAY_BIN).limited([-np.inf, -30.0, 0.0]).round(2).tolist()
@@ -120,6 +123,6 @@ class Wanted:
     scale: float
 
     def record(self) -> dict[str, object]:
-        """The description sent to the program: name, kind, unit, and the limits that the study states."""
+        """The description sent to the program: name, kind, unit, and the limits stated in the study."""
         limits = {key: value for key, value in asdict(self.statistic).items() if value is not None}
         return {"name": self.name, "unit": self.unit, **limits}

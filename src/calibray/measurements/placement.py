@@ -1,4 +1,4 @@
-"""Place both ends of each row in the scene's frame, from columns or a track, and move receivers out of buildings."""
+"""Determine the positions of both ends of each row in the scene frame, and move receivers out of buildings."""
 
 from __future__ import annotations
 
@@ -16,23 +16,26 @@ from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.support.messages import first_line
 
 TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
-"""The columns with a row's position on a track [deg]."""
+"""The columns with the position of a row on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
-"""The entry in `changes` for rows outside the times of a track; names another time zone if it fits clearly better."""
+"""The entry in `changes` for rows outside the times of a track. The entry also states a different time zone if this
+fits clearly better."""
 
 MAX_FILE_SIZE: Final = 200_000_000
-"""Largest GPX file that is read [bytes]; a track with one point per second reaches this size after three weeks."""
+"""Size limit of a GPX file [bytes]. A track with one point per second reaches this size after three weeks."""
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
-    """Give rows positions on a track, interpolated linearly in time; rows outside the track's times are left out.
+    """Add the positions on a track to rows, interpolated linearly in time.
 
-    Times are texts in ISO 8601 (UTC unless they state a time zone), or seconds since 1970. Altitudes are not used,
+    Rows outside the times of the track are left out.
+
+    Times are texts in ISO 8601 (UTC unless a time zone is stated) or seconds since 1970. Altitudes are not used,
     because altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
-        InputError: The track or a time cannot be read, or no row lies within the times of the track.
+        InputError: The track or a time cannot be read, or no row is within the times of the track.
     """
     points = _read_gpx(Path(track.file))
     seconds = _row_times(table, track) - track.clock
@@ -43,11 +46,13 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     if not covered.any():
         first, last = points["time"].iloc[0], points["time"].iloc[-1]
         remedy = (
-            f"with {clock}, some are; check the time zone" if shift else "check the time zone and the clock"
+            f"with {clock}, some would be; check the time zone"
+            if shift
+            else "check the time zone and the clock"
         )
         raise InputError(
             f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} is on the track, "
-            f"{first} to {last}; {remedy}"
+            f"which covers {first} to {last}; {remedy}"
         )
     table = table.keep(covered, NOT_ON_TRACK + (f", which {clock} would keep" if shift else ""))
     # Unwrapped longitudes continue beyond 180 degrees where the track crosses the antimeridian.
@@ -57,7 +62,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
 
 
 def read_times(table: SourceTable, name: str) -> NDArray[np.float64]:
-    """Times in a column [rows], texts in ISO 8601 or numbers [s], as seconds since 1970; NaN if missing.
+    """Times in a column [rows] of texts in ISO 8601 or numbers [s], as seconds since 1970; NaN if missing.
 
     Raises:
         InputError: There is no such column, or a time cannot be read.
@@ -76,7 +81,7 @@ def read_times(table: SourceTable, name: str) -> NDArray[np.float64]:
 
 
 def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
-    """Times of the rows [rows], [s] since 1970; NaN if missing."""
+    """Times of the rows in seconds since 1970 [rows]; NaN if missing."""
     column = table.column(track.time)
     seconds = read_times(table, track.time)
     if pd.api.types.is_numeric_dtype(column):
@@ -84,7 +89,7 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
     days = seconds[np.isfinite(seconds)] / 86_400
     if len(days) and (days % 1 == 0).all() and not column.astype(str).str.contains(":").any():
         raise InputError(
-            f"{table.source}, column {track.time!r}: contains dates without times; write date and time in one "
+            f"{table.source}, column {track.time!r}: contains dates without times; write the date and time in one "
             "column, such as 2026-05-31T14:05:09.2Z"
         )
     return seconds
@@ -93,7 +98,7 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
 def _covered(
     times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float
 ) -> NDArray[np.bool_]:
-    """Mask of rows that lie between two successive track points with at most `longest_gap` between their times."""
+    """Mask of rows between two successive track points with times that differ by at most `longest_gap`."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
     # For a row at exactly the time of a point, the gaps next to this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
@@ -103,9 +108,10 @@ def _covered(
 
 
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
-    """Time zone by which the rows' clock is ahead of the track's [s]; 0 unless it puts clearly more rows on the track.
+    """Time-zone shift of the rows relative to the track [s]; 0 unless it places clearly more rows on the track.
 
-    Time zones are tried if at least a tenth of the rows are off the track; the best must more than halve that number.
+    Time zones are tested if at least a tenth of the rows are off the track. A shift must more than halve the number of
+    these rows.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]
@@ -118,7 +124,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
 
 
 def _reason(error: Exception) -> str:
-    """The reason why pandas cannot read a time, without its advice on arguments."""
+    """The reason why pandas cannot read a time, without advice on arguments."""
     return first_line(error).partition(". You might")[0]
 
 
@@ -131,19 +137,23 @@ def _read_gpx(path: Path) -> pd.DataFrame:
     """Time (UTC), longitude and latitude [deg] of all track points, in chronological order."""
     try:
         if path.stat().st_size > MAX_FILE_SIZE:
-            raise InputError(f"track {path}: larger than {MAX_FILE_SIZE / 1e6:.0f} MB; split it")
+            raise InputError(f"track {path}: larger than {MAX_FILE_SIZE / 1e6:.0f} MB; split the file")
         text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"track {path}: does not exist; check the path") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"track {path}: not UTF-8 text ({error.reason}); export it as GPX again") from None
+        raise InputError(
+            f"track {path}: not UTF-8 text ({error.reason}); export the track as GPX again"
+        ) from None
     # A GPX track needs no document type; entities could expand beyond memory.
     if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"track {path}: declares a document type, which GPX does not use; export it again")
+        raise InputError(
+            f"track {path}: declares a document type, which GPX does not use; export the track again"
+        )
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputError(f"track {path}: not well-formed XML ({error}); export it again") from None
+        raise InputError(f"track {path}: not well-formed XML ({error}); export the track again") from None
     rows = [_point(path, element) for element in root.iter() if _tag(element) == "trkpt"]
     points = pd.DataFrame(rows, columns=["time", "longitude", "latitude"]).dropna(subset=["time"])
     if points.empty:
@@ -154,7 +164,7 @@ def _read_gpx(path: Path) -> pd.DataFrame:
         _seconds(points["time"])
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"track {path}: a time is not ISO 8601 or out of range ({_reason(error)}); export it again"
+            f"track {path}: a time is not in ISO 8601 or is out of range ({_reason(error)}); export the track again"
         ) from None
     return points.sort_values("time", kind="stable").drop_duplicates("time").reset_index(drop=True)
 
@@ -164,7 +174,7 @@ def _point(path: Path, element: ElementTree.Element) -> tuple[str | None, float,
     try:
         longitude, latitude = float(element.get("lon", "")), float(element.get("lat", ""))
     except ValueError as error:
-        raise InputError(f"track {path}: a point is malformed ({error}); export it again") from None
+        raise InputError(f"track {path}: a point is malformed ({error}); export the track again") from None
     return (times[-1] or None) if times else None, longitude, latitude
 
 
@@ -174,23 +184,23 @@ def _tag(element: ElementTree.Element) -> str:
 
 
 TX_COLUMNS: Final = ("tx_x", "tx_y", "tx_z")
-"""The columns of transmitter positions in the scene's frame [m]."""
+"""The columns of transmitter positions in the scene frame [m]."""
 
 RX_COLUMNS: Final = ("rx_x", "rx_y", "rx_z")
-"""The columns of receiver positions in the scene's frame [m]."""
+"""The columns of receiver positions in the scene frame [m]."""
 
 POSITION_COLUMNS: Final = (*TX_COLUMNS, *RX_COLUMNS)
 """The columns of the positions of both ends [m]."""
 
 
 def position_columns(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """The columns `POSITION_COLUMNS` of links with ends at `tx` and `rx` [n, 3], [m]; `tx` may be one position [3]."""
+    """The columns `POSITION_COLUMNS` of links with ends at `tx` ([3] if all are equal) and `rx` [n, 3], [m]."""
     ends = np.hstack([np.broadcast_to(tx, rx.shape), rx])
     return dict(zip(POSITION_COLUMNS, ends.T, strict=True))
 
 
 def ends_of(frame: pd.DataFrame) -> NDArray[np.float64] | None:
-    """The positions [rows, 6], [m], in the columns `POSITION_COLUMNS` of a table; None if it lacks one of them."""
+    """The positions [rows, 6], [m], in the columns `POSITION_COLUMNS` of a table; None if a column is missing."""
     if not set(POSITION_COLUMNS) <= set(frame.columns):
         return None
     return frame[list(POSITION_COLUMNS)].to_numpy(float)
@@ -201,11 +211,12 @@ def place_rows(
 ) -> tuple[SourceTable, Coordinates, Coordinates]:
     """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
-    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`), or with a frame, longitude, latitude
-    [deg] and height [m]. Returns the rows and the names of the columns; if a filter is the only step, the arguments.
+    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude, latitude
+    [deg] and height [m]. The rows and the names of the columns are returned. If a filter is the only step, the
+    arguments are returned unchanged.
 
     Raises:
-        InputError: A column is missing or not numeric, or a position is not on the globe.
+        InputError: A column is missing or not numeric, or a geographic position is invalid.
     """
     if steps.is_filter_only:
         return table, tx, rx
@@ -239,10 +250,10 @@ def _positions(
 
 
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
-    """Leave out or move receivers that are inside buildings in plan view.
+    """Leave out or move receivers that are inside the outlines of buildings.
 
-    The steps `inside` and `outside` are used; without them, the table is returned unchanged. With the step `ground`, a
-    moved receiver keeps its height above the ground.
+    The steps `inside` and `outside` are used. Without these steps, the table is returned unchanged. With the step
+    `ground`, moved receivers keep their heights above the ground.
 
     Raises:
         InputError: No row remains.

@@ -1,4 +1,4 @@
-"""The meaning of a table's columns, and the steps that convert its rows to links."""
+"""The meaning of the columns of a table, and the steps that convert the rows to links."""
 
 from __future__ import annotations
 
@@ -20,35 +20,37 @@ Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64
 """Height of the ground [m] as a function of x and y [m]."""
 
 MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Maps positions [n, 3] to positions outside buildings (NaN if too deep inside) and the distances of the moves [n],
-[m]."""
+"""Function from positions [n, 3], [m] to positions outside buildings (NaN if too deep inside) and the distances of the
+moves [n], [m]."""
 
 Compute = Callable[[SourceTable], NDArray[np.float64] | None]
-"""Function from the rows of a table to the values of a new column [rows]; None if a column that it needs is missing."""
+"""Function from the rows of a table to the values of a new column [rows]; it returns None if a required column is
+missing."""
 
 Divide = Callable[[SourceTable], NDArray[Any]]
-"""Function from the rows of a table to the labels of the parts to which they belong [rows]."""
+"""Function from the rows of a table to the labels of the parts to which the rows belong [rows]."""
 
 
 @dataclass(frozen=True)
 class LinkColumns:
-    """The columns of a table that describe its links.
+    """The columns of a table that describe the links.
 
     Attributes:
         tx: Transmitter position: x, y, z [m], or longitude, latitude [deg] and height [m].
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: received power with
-            unknown transmitted power. The path loss is then the negative of the received power, and an offset includes
-            the transmitted power.
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for a received power with
+            an unknown transmitted power. With "rsrp", the path loss is the negative of the received power, and an
+            offset includes the transmitted power.
         group: Column of group labels, or several columns whose labels are joined.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power".
-        frequency: Column of carrier frequencies, in hertz or the unit in its name.
+        frequency: Column of carrier frequencies, in hertz or in the unit that its name states.
 
     Raises:
-        InputError: The quantity is unknown or does not match `tx_power_dbm`, or both `weight` and `std` are given.
+        InputError: The quantity is unknown or is inconsistent with `tx_power_dbm`, or both `weight` and `std` are
+            given.
     """
 
     tx: Coordinates
@@ -67,26 +69,28 @@ class LinkColumns:
             raise InputError(f"quantity = {self.quantity!r}: unknown, {remedy}")
         if self.quantity == "received_power" and self.tx_power_dbm is None:
             raise InputError(
-                "quantity = 'received_power' needs tx_power_dbm [dBm]; if it is unknown, set quantity = 'rsrp' and "
-                "add an [offset]"
+                "quantity = 'received_power' needs tx_power_dbm [dBm]; if this power is unknown, set quantity = 'rsrp' "
+                "and add an [offset]"
             )
         if self.quantity != "received_power" and self.tx_power_dbm is not None:
-            raise InputError(f"quantity = {self.quantity!r} takes no tx_power_dbm; remove it")
+            raise InputError(
+                f"quantity = {self.quantity!r} cannot be combined with tx_power_dbm; remove tx_power_dbm"
+            )
         if self.weight is not None and self.std is not None:
-            raise InputError(f"weight = {self.weight!r} and std = {self.std!r}: give one of them")
+            raise InputError(f"weight = {self.weight!r} and std = {self.std!r}: give only one of these")
 
 
 @dataclass(frozen=True)
 class Averaging:
-    """How samples are averaged, in linear power.
+    """Averaging of samples, in linear power.
 
     Attributes:
-        by: Which samples are averaged together: those at one "place" (equal receiver positions), in one "cell" of a
-            square grid, in one stretch of "distance" travelled (in the order of the rows), or in one window of "time".
+        by: Samples that are averaged together: samples at one "place" (equal receiver positions), in one "cell" of a
+            square grid, in one interval of "distance" travelled (in the order of the rows), or in one window of "time".
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias in the logarithm of a mean over few samples.
-        minimum_count: Smallest number of samples in an average; averages of fewer samples are left out.
+        minimum_count: Smallest number of samples in an average; averages over fewer samples are left out.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -98,13 +102,13 @@ class Averaging:
 
 @dataclass(frozen=True)
 class Track:
-    """A GPX track, which gives rows a position at their times.
+    """A GPX track from which the positions of rows are interpolated at their times.
 
     Attributes:
         file: GPX file.
         time: Column with the times of the rows.
-        longest_gap: Longest time between two track points [s]; rows between points farther apart in time are left out.
-        clock: Time by which the rows' clock is ahead of the track's [s].
+        longest_gap: Longest time between two track points [s]; rows in longer gaps are left out.
+        clock: Time by which the clock of the rows is ahead of the clock of the track [s].
     """
 
     file: str
@@ -118,26 +122,27 @@ class Preparation:
     """The steps that convert rows to links; none by default.
 
     Attributes:
-        wide: Transmitter name for each column, for a table with one column per transmitter.
-        track: Track that gives each row the columns `selection.TRACK_COLUMNS` [deg].
+        wide: Names of the transmitters by column, for a table with one column per transmitter.
+        track: Track from which the columns `placement.TRACK_COLUMNS` [deg] are added to the rows.
         where: Row filter.
-        transmitters: Table with one row per transmitter, whose other columns are added to the links.
-        transmitter: Column that names the transmitter in both tables.
-        missing: Numbers that stand for a missing value, in addition to those that are recognized automatically.
-        noise_floor_dbm: Noise floor [dBm]; missing powers count as below the floor.
-        censored: Whether links at or below the noise floor are kept, as censored links at the floor.
-        frame: Geographic frame of the scene, if positions are longitude, latitude and height; None if they are lengths.
-        crs: Coordinate reference system of positions, if there is a frame.
-        unit_m: Length of one unit of position columns in the scene's frame [m].
-        ground: Function that gives the height of the ground; None if heights are not measured from the ground.
+        transmitters: Table with one row per transmitter. The columns other than the name are added to the links.
+        transmitter: Column with the name of the transmitter, in both tables.
+        missing: Numbers that represent missing values, in addition to the codes that are recognized automatically.
+        noise_floor_dbm: Noise floor [dBm]. Missing powers are treated as below the noise floor.
+        censored: Whether links at or below the noise floor are kept as censored links.
+        frame: Georeference of the scene if positions are geographic; None if positions are in the scene frame.
+        crs: Coordinate reference system of the positions; used only with `frame`.
+        unit_m: Unit of the position columns in the scene frame [m].
+        ground: Function that returns the height of the ground; None if heights are not measured from the ground.
         averaging: How samples are averaged.
-        keep: Columns whose groups are averaged separately, in addition to the transmitter column.
-        held_out: Function that labels the parts held out separately; samples are not averaged or merged across parts.
-        observables: Columns of additional measured values, which are averaged over rows that repeat a link.
-        flights: Observables that are times of flight, in which certain numbers can stand for a missing value.
-        computed: Functions that compute additional columns, by name, after the transmitters' columns are added. A
-            function returns None if an optional column that it needs is missing.
-        inside: What to do with receivers inside buildings: "drop", "move", or None to keep them where they are.
+        keep: Columns of labels of groups that are averaged separately, in addition to the transmitter column.
+        held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
+            merged across parts.
+        observables: Columns of additional measured values, which are averaged over the rows of a link.
+        flights: Columns of times of flight, in which certain numbers can represent missing values.
+        computed: Functions that compute additional columns, by name of the column, after the columns of the
+            transmitters have been added. A function returns None if an optional column that it requires is missing.
+        inside: Treatment of receivers inside buildings: "drop", "move", or None to keep their positions.
         outside: Function that moves positions out of buildings; required with `inside`.
     """
 

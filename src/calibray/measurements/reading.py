@@ -1,13 +1,13 @@
-"""From a table to links: reading the file, selecting, placing, averaging or merging rows, and checking the links.
+"""Conversion of a table to links: reading the file, selecting, positioning, averaging or merging rows, and checks.
 
-Samples are averaged in linear power, to one row per area or place. Along a street, the power fades by several dB within
-a wavelength. Ray tracing to one point does not predict this fading; it predicts the mean power over a few tens of
-wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1),
-1985: 40 wavelengths, 36 to 50 samples). Linear powers are averaged, not decibels: for Rayleigh fading, the mean of the
-decibel values is 2.5 dB too low.
+Samples are averaged in linear power to one row per area or position. Along a street, the power fades by several dB
+within a wavelength. Ray tracing to a single point does not predict this fading, but it does predict the mean power over
+a few tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh.
+Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). Decibel values are not averaged, because their mean is 2.5 dB
+too low for Rayleigh fading.
 
-The logarithm of a mean of few samples is also biased low, by (10 / ln 10) var / (2 n mean^2) to second order (delta
-method): 0.2 dB for ten samples with Rayleigh fading, and zero for a single path.
+The logarithm of a mean over few samples is also biased low, by (10 / ln 10) var / (2 n mean^2) to second order (delta
+method). This bias is 0.2 dB for ten samples with Rayleigh fading, and zero for a single path.
 """
 
 from __future__ import annotations
@@ -51,21 +51,22 @@ def read_measurements(
 
     Args:
         path: The table: .csv, .parquet or .xlsx.
-        tx: Transmitter position (x, y, z) [m] in the scene's frame, each a number or the name of a column.
+        tx: Transmitter position (x, y, z) [m] in the scene frame. Each coordinate is a number or the name of a column.
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm],
-            received power with unknown transmitted power (see `LinkColumns`).
-        where: Row filter on the columns (see `filters`); rows that do not pass are left out before any check.
+        quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for
+            a received power with an unknown transmitted power (see `LinkColumns`).
+        where: Row filter on the columns (see `filters`). Rows that do not pass are removed before any check.
         group: Column of group labels.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
-        tx_power_dbm: Transmitted power [dBm], a number or a column, only for "received_power": the path loss is this
-            power minus the received power, including antenna gains and cable losses.
-        frequency: Column of carrier frequencies, in hertz or the unit in its name, for links at several frequencies.
+        tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power". The path loss is this
+            power minus the received power, and includes antenna gains and cable losses.
+        frequency: Column of carrier frequencies, in hertz or in the unit that its name states, for links at several
+            frequencies.
 
     Returns:
-        The links that pass, in the order of the file.
+        The links that pass the filter, in the order of the file.
 
     Raises:
         InputError: The file or a column is missing or malformed, a value is missing, not a number or implausible, or
@@ -78,7 +79,7 @@ def read_measurements(
 def measured_links(
     table: SourceTable, columns: LinkColumns, steps: Preparation | None = None
 ) -> Measurements:
-    """Convert the rows of a table to measured links; `prepared` counts the rows left out, averaged or changed.
+    """Convert the rows of a table to measured links. `prepared` contains the numbers of excluded or changed rows.
 
     Raises:
         InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
@@ -98,7 +99,7 @@ def measured_links(
 def _note_unused(
     table: SourceTable, chosen: SourceTable, steps: Preparation, columns: LinkColumns
 ) -> SourceTable:
-    """Note the transmitters and groups that have chosen rows, but none in the table."""
+    """Record the transmitters and groups with chosen rows of which none remains in the table."""
     groups = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     for name in dict.fromkeys([*groups, steps.transmitter]):
         if name not in table.frame or name not in chosen.frame:
@@ -123,16 +124,16 @@ def links_from_table(
     tx: Coordinates = TX_COLUMNS,
     rx: Coordinates = RX_COLUMNS,
 ) -> Measurements:
-    """Make links without measured values from the rows of a table; their path loss is NaN.
+    """Create links without measured values from the rows of a table. Their path loss is NaN.
 
-    If `group` names several columns, their labels are joined. `frequency` is a column of carrier frequencies; if it is
-    None or missing in the table, all links have the study's carrier frequency. No step may leave out rows.
+    If `group` names several columns, their labels are joined. `frequency` is a column of carrier frequencies. If
+    `frequency` is None or missing in the table, all links have the carrier of the study. No step may remove rows.
 
     Raises:
         InputError: There are no rows, a column is missing or malformed, or a position is not finite.
     """
     if len(table) == 0:
-        raise InputError(f"{table.source}: contains no rows; give at least one link")
+        raise InputError(f"{table.source}: contains no rows; at least one link is required")
     steps = steps or Preparation()
     table, tx, rx = place_rows(select_rows(table, steps), steps, tx, rx)
     return Measurements(
@@ -146,18 +147,21 @@ def links_from_table(
 
 
 PLAUSIBLE_PATH_LOSS_DB: Final = (20.0, 250.0)
-"""Range of plausible path losses [dB]; a value outside it usually has the wrong sign, unit or column."""
+"""Range of plausible path losses [dB]. A value outside this range usually has the wrong sign or unit, or is from the
+wrong column."""
 
 PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
-"""Range of plausible received powers [dBm]; a value outside it usually has the wrong sign, unit or column."""
+"""Range of plausible received powers [dBm]. A value outside this range usually has the wrong sign or unit, or is from
+the wrong column."""
 
 
 LINEAR: Final = 0.1
-"""If all received powers in a table are below this in magnitude, their unit is not dBm but, for example, watts."""
+"""Limit of the magnitude of received powers. If all powers in a table are below this limit, the unit is not dBm but,
+for example, watts."""
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
-    """Make one link from each row; positions are in metres. The steps `noise_floor_dbm` and `censored` are used here.
+    """Create one link from each row. Positions are in metres. The steps `noise_floor_dbm` and `censored` are used.
 
     Raises:
         InputError: A column is missing, or a value is missing, not a number or implausible.
@@ -189,24 +193,27 @@ def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | N
 
 
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
-    """Path loss [rows], [dB]; the negative of the received power [dBm] if the transmitted power is unknown."""
+    """Path loss [rows], [dB]; the negative received power [dBm] if the transmitted power is unknown."""
     measured = table.numbers(columns.value)
     if columns.quantity in ("rsrp", "received_power") and np.abs(measured).max() < LINEAR:
         raise InputError(
-            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, typical of watts; "
-            "convert them to dBm"
+            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, typical of watts; convert "
+            "the values to dBm"
         )
     match columns.quantity:
         case "rsrp":
             _check_range(table, columns, measured, PLAUSIBLE_POWER_DBM, "check the sign and the unit")
             return -measured
         case "path_loss":
-            loss, remedy = measured, "set quantity = 'path_gain' or 'received_power' if it is one of these"
+            loss, remedy = (
+                measured,
+                "set quantity = 'path_gain' or 'received_power' if the column contains one of these",
+            )
         case "path_gain":
-            loss, remedy = -measured, "set quantity = 'path_loss' if it is one"
+            loss, remedy = -measured, "set quantity = 'path_loss' if the column contains path loss"
         case "received_power":
             loss = table.numbers(columns.tx_power_dbm) - measured  # type: ignore[arg-type]
-            remedy = "check tx_power_dbm and the unit, dBm"
+            remedy = "check tx_power_dbm and that all powers are in dBm"
     _check_range(table, columns, loss, PLAUSIBLE_PATH_LOSS_DB, remedy)
     return loss
 
@@ -224,9 +231,9 @@ def _check_range(
         first = int(np.flatnonzero(implausible)[0])
         quantity, unit = ("received power", "dBm") if columns.quantity == "rsrp" else ("path loss", "dB")
         raise InputError(
-            f"{table.cell(first, columns.value)}: {table.numbers(columns.value)[first]:g} means a {quantity} of "
-            f"{values[first]:g} {unit}, must be {lowest:g} to {highest:g} {unit} ({implausible.sum()} of {len(table)} "
-            f"rows); {remedy}"
+            f"{table.cell(first, columns.value)}: {table.numbers(columns.value)[first]:g} corresponds to a {quantity} "
+            f"of {values[first]:g} {unit}, must be {lowest:g} to {highest:g} {unit} ({implausible.sum()} of "
+            f"{len(table)} rows); {remedy}"
         )
 
 
@@ -248,20 +255,22 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
 
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Averages are left out if samples below the noise floor make them uncertain by more than this [dB]."""
+"""Largest uncertainty of an average due to samples below the noise floor; averages with a larger uncertainty are left
+out [dB]."""
 
 _AREA: Final = "calibray area"
 _PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average samples of the same area, transmitter, frequency and group; without averaging, the table is unchanged.
+    """Average samples of the same area, transmitter, frequency and group. Without averaging, the table is unchanged.
 
-    A sample below the noise floor has a power between zero and the floor, and counts as half the floor. Averages whose
-    uncertainty then exceeds `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above the
+    A sample below the noise floor has a power between zero and the floor, and is averaged as half the floor. Averages
+    with an uncertainty above `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above the
     floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Each average is the
-    row of its first sample, with the mean receiver position, the mean value, the means of weights and other
-    observables, and the columns `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count`.
+    row of its first sample, with the mean receiver position, the mean value, and the means of weights and other
+    observables. The added columns are `std_db` (standard deviation of the samples [dB], NaN for one sample) and
+    `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -332,7 +341,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
 
 
 def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArray[np.int64]:
-    """Index of the place, cell, stretch or window of each row [rows]; `rx` names the columns of x, y and z [m]."""
+    """Index of the position, cell, interval or window of each row [rows]; `rx` names the columns of x, y and z [m]."""
     if averaging.by == "place":
         positions = np.stack([table.numbers(name) for name in rx], axis=1)
         return join_positions(positions)
@@ -351,7 +360,7 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
 
 
 LATEST: Final = 1e11
-"""Largest number of seconds since 1970; phone loggers write milliseconds, which are 1000 times larger."""
+"""Largest plausible number of seconds since 1970. Loggers on phones write milliseconds, which are 1000 times larger."""
 
 
 def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
@@ -361,7 +370,7 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
         seconds = table.numbers(time)
         if seconds.max() > LATEST:
             raise InputError(
-                f"{table.source}, column {time!r}: {seconds.max():g} s since 1970 is beyond the year 5000; give seconds"
+                f"{table.source}, column {time!r}: {seconds.max():g} s since 1970 is after the year 5000; give seconds"
             )
         return seconds
     seconds = read_times(table, time)
@@ -371,18 +380,19 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
 
 
 SAME_POSITION: Final = 1e-4
-"""Distance per axis up to which positions count as equal, as in meshes [m]. Coordinates are written to a millimetre at
-best, and coordinate conversions differ by micrometres."""
+"""Distance per axis up to which positions are treated as equal, as in meshes [m]. Coordinates are written with a
+resolution of a millimetre at best, and coordinate conversions differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of each link into its first row, with the means of linear power, weights and other observables.
+    """Merge the rows of each link into the first row, with the means of linear power, weights and other observables.
 
-    Rows belong to one link if their positions agree within `SAME_POSITION`, and transmitter, kept columns, carrier
-    frequency, transmitted power and times are equal. Rows at different times remain separate links. A link below the
-    noise floor is not merged with one above it, nor a held-out row with others. Receivers inside buildings are moved
-    only after merging, because two positions may move to the same corner. The steps `keep`, `held_out`, `observables`,
-    `transmitter`, `noise_floor_dbm` and `averaging` are used; after averaging, no repeats remain to be merged.
+    Rows belong to one link if their positions agree within `SAME_POSITION`, and the transmitter, kept columns, carrier
+    frequency, transmitted power and times are equal. Rows at different times remain separate links. Rows below the
+    noise floor are not merged with rows above the floor, and held-out rows are not merged with other rows. Receivers
+    inside buildings are moved after merging, because two positions can be moved to the same corner. The steps `keep`,
+    `held_out`, `observables`, `transmitter`, `noise_floor_dbm` and `averaging` are used. After averaging, the table is
+    unchanged, because no repeats remain.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -426,18 +436,20 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
 
 
 def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Mean of a column's values, ignoring missing ones, over each group of rows; `group` numbers the rows [rows]."""
+    """Mean of a column over each group of rows, ignoring missing values; `group` is the index of the group [rows]."""
     return np.asarray(pd.Series(table.numbers(name, gaps=True)).groupby(group).mean(), dtype=np.float64)
 
 
 LEAST_STEP_DB: Final = 1.0
-"""If rows with different labels in a column become one link, effects of a label on the power are noted above this."""
+"""Smallest effect of a label on the power that is recorded if rows with different labels in a column become one link
+[dB]."""
 
 LEAST_RATIO: Final = 5.0
-"""The effect must also exceed its standard error by this factor; by chance, one in two million labels does."""
+"""Smallest ratio of this effect to its standard error. One in two million labels exceeds this ratio by chance."""
 
 MOST_LABELS: Final = 50
-"""Columns with more labels are not examined for such effects, because they probably name links or positions."""
+"""Largest number of labels in a column that is tested for such effects. A column with more labels probably names links
+or positions."""
 
 
 def _note_steps(
@@ -447,16 +459,16 @@ def _note_steps(
     usable: NDArray[np.bool_],
     apart: Sequence[str],
 ) -> SourceTable:
-    """Note text columns, such as days, whose labels affect the power of a link although rows are averaged over them.
+    """Record text columns, such as days, with labels that affect the power but are averaged into one link.
 
-    Each link counts as one observation of this effect, because its rows can share errors.
+    Each link is one observation of this effect, because the rows of a link can share errors.
 
     Args:
         table: The rows.
-        link: The link or average to which each row belongs [rows].
+        link: Index of the link or average to which each row belongs [rows].
         level: Power or gain [rows], [dB].
-        usable: Mask of the rows whose level is above the noise floor [rows].
-        apart: Columns whose labels are kept apart in averaging.
+        usable: Mask of the rows with a level above the noise floor [rows].
+        apart: Columns of labels that are averaged separately.
     """
     rows = pd.DataFrame({"link": link, "level": level})[usable]
     for name in [str(name) for name in table.frame if name not in apart]:
@@ -480,7 +492,7 @@ def _note_steps(
                 largest_db, at = step_db, str(label)
         if at:
             cause = (
-                f"of one link over several values of {shortened(name)}: the power at {shortened(at)} differs by "
+                f"rows averaged over several values of {shortened(name)}: the power at {shortened(at)} differs by "
                 f"{largest_db:+.1f} dB; name the column in offset.per"
             )
             table = table.note(cause, int(usable.sum()))
@@ -488,7 +500,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions; samples that differ in one are not averaged."""
+    """Columns that distinguish links at the same positions. Samples that differ in such a column are not averaged."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
@@ -500,10 +512,10 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
 def join_positions(
     positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Number the distinct places [N] among positions [N, axes], [m], in the order of their first occurrence.
+    """Index of each position [N, axes], [m], among the distinct positions, in the order of first occurrence [N].
 
-    Positions within `SAME_POSITION` of each other, directly or through other positions, are one place, unless they
-    belong to different groups [N].
+    Positions within `SAME_POSITION` of each other, directly or through other positions, are treated as equal unless
+    they belong to different groups [N].
 
     Example:
         >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()

@@ -1,4 +1,4 @@
-"""Select rows and complete their columns: wide tables, tracks, filters, transmitters, the noise floor."""
+"""Selection of rows and completion of their columns: wide tables, tracks, filters, transmitters, noise floor."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
     """Select the rows that become links.
 
     The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `computed`, `noise_floor_dbm` and
-    `censored` run in this order, so a filter can use the columns of the track but not those of the transmitters.
-    `value` is the column of the measured values; with `wide`, it is the name of the new column. Numbers that stand for
-    a missing value (`find_codes`) are treated as missing. With a noise floor, missing values and values at or below it
+    `censored` are applied in this order. A filter can therefore use the columns of the track, but not those of the
+    transmitters. `value` is the column of the measured values; with `wide`, it is the name of the new column. Codes for
+    missing values (`find_codes`) are treated as missing. With a noise floor, missing values and values below the floor
     are set to the floor.
 
     Raises:
@@ -42,7 +42,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 
 
 def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
-    """The first steps of `select_rows`, which choose rows: `wide`, `track` and `where`."""
+    """Apply the first steps of `select_rows`, which choose rows: `wide`, `track` and `where`."""
     if steps.wide:
         table, _ = mask_codes(table, list(steps.wide), steps.missing)
         table = melt(table, steps.wide, value, steps.transmitter)
@@ -52,15 +52,15 @@ def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTab
         mask = table.where(steps.where)
         if not mask.any():
             raise InputError(
-                f"{table.source}: where = {shortened(steps.where)!r} passes none of {len(table)} rows; "
-                "change the filter"
+                f"{table.source}: where = {shortened(steps.where)!r} selects none of {len(table)} rows; change the "
+                "filter"
             )
         table = table.select(mask)
     return table
 
 
 def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
-    """The other steps of `select_rows`, which complete rows and leave out those without a usable value."""
+    """Apply the other steps of `select_rows`, which complete rows and leave out rows without a usable value."""
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
         # With a noise floor, a missing power was too weak to measure; without one, it carries no information.
@@ -73,7 +73,7 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
     for name in steps.flights:
         if name in table.frame and (codes := find_codes(_numbers(table.frame[name]), np.inf)):
             coded = table.frame[name].isin(codes)
-            cause = f"values of {name} that mean not measured ({', '.join(f'{code:g}' for code in codes)})"
+            cause = f"codes for missing values in {name} ({', '.join(f'{code:g}' for code in codes)})"
             table = table.assign(**{name: table.frame[name].mask(coded)}).note(cause, int(coded.sum()))
     if steps.transmitters is not None:
         table = _join_transmitters(table, steps.transmitters, steps.transmitter)
@@ -88,17 +88,18 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
 def melt(
     table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
 ) -> SourceTable:
-    """Convert a table with one column per transmitter to one row per link; links from one row stay together.
+    """Convert a table with one column per transmitter to one row per link. Links from one row stay together.
 
-    `value` and `transmitter` name the new columns. With `keep_empty`, cells without a value also become links, as
-    needed for prediction.
+    `value` and `transmitter` are the names of the new columns. With `keep_empty`, cells without a value also become
+    links, as required for prediction.
 
     Raises:
-        InputError: A column is missing, not numeric or named like a new column, or no cell has a value.
+        InputError: A column is missing, not numeric or has the name of a new column, or no cell has a value.
     """
     if len(set(columns.values())) != len(columns):
         raise InputError(
-            f"wide = {dict(columns)}: two columns have the same transmitter; give each a different name"
+            f"wide = {dict(columns)}: two columns have the same transmitter; use a different transmitter name for each "
+            "column"
         )
     others = [name for name in table.frame if name not in columns]
     for name in (value, transmitter):
@@ -118,9 +119,10 @@ def melt(
 
 
 def plain_labels(column: Iterable[object]) -> list[str]:
-    """Normalize labels: lower case, no leading or trailing white space, 5 for 5.0, and colons for hyphens.
+    """Normalize labels: lower case, no leading or trailing white space, 5 instead of 5.0, colons instead of hyphens.
 
-    Tools write the same address as `AA-BB` or as `aa:bb`, and whole numbers as floats if a column has gaps.
+    Different tools write the same address as `AA-BB` or `aa:bb`, and write whole numbers as floats if a column has
+    gaps.
 
     Example:
         >>> plain_labels(["C4-64", "c4:64 ", 5.0])
@@ -133,7 +135,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """Choose the function that normalizes names for comparison: `plain_labels`, unless it makes two names equal."""
+    """Choose the function that normalizes names for comparison: `plain_labels`, unless two names become equal."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels
@@ -141,9 +143,11 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column that names the transmitters in their table: no value twice, and at least half of the given labels.
+    """The column with the names of the transmitters in their table.
 
-    Returns None if no column or more than one column qualifies.
+    The values are distinct and include at least half of the given labels.
+
+    The result is None if no column or more than one column qualifies.
 
     Example:
         >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
@@ -159,12 +163,14 @@ def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str |
 
 
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Add the transmitters' other columns to the links; the column of transmitter names may have a different name."""
+    """Add the columns of the table of transmitters to the links; the columns of names can have different names."""
     label_of_link = table.labels(key).tolist()
     name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
     labels = transmitters.labels(name).tolist()
     if len(set(labels)) != len(labels):
-        raise InputError(f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one")
+        raise InputError(
+            f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one of the rows"
+        )
     compared = comparison(labels)
     index_of_label = {label: index for index, label in enumerate(compared(labels))}
     compared_of_link = compared(label_of_link)
@@ -175,7 +181,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
         more = f" and {len(unknown) - MAX_LISTED} more" if len(unknown) > MAX_LISTED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
-            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add them, or remove their rows with links.where, as in "
+            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add these, or remove their rows with links.where, as in "
             f'where = "`{key}` not in [{cells}]"'
         )
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
@@ -188,12 +194,12 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
 
 
 def _apply_noise_floor(table: SourceTable, steps: Preparation, floor: float, value: str) -> SourceTable:
-    """Set powers at or below the noise floor to the floor; leave out these rows unless a later step uses them."""
+    """Set powers at or below the noise floor to the floor. These rows are left out unless a later step uses them."""
     power = table.numbers(value, gaps=True)
     below = ~(power > floor)  # A missing power counts as below the floor.
     table = table.assign(**{value: np.where(below, floor, power)})
     if steps.censored:
-        return table.note("at or below the noise floor, counted as censored", below.sum())
+        return table.note("at or below the noise floor, treated as censored", below.sum())
     if steps.averaging is None:
         return table.keep(~below, "at or below the noise floor, left out")
     return table
@@ -203,21 +209,22 @@ CODES: Final = (
     *(0, 1, -1, 99, 100, 101, 127, 128, 255, 500, 999, 1000, 9999, 32767, 65535, 99999, 2147483647),
     *(-200, -255, -256, -500, -999, -1000, -9999, -32768, -99999, -2147483648),
 )  # fmt: skip
-"""Codes that loggers write for missing values: UJIIndoorLoc (100), Wi-Fi RTT logs (-200), Android (2147483647), and
-others."""
+"""Codes that loggers write for missing values, for example UJIIndoorLoc (100), Wi-Fi RTT logs (-200) and Android
+(2147483647)."""
 
 MIN_GAP_DB: Final = 20.0
-"""A number counts as a code only if it differs from every measured value by at least this much [dB]."""
+"""Smallest difference between a code and every measured value [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
-"""Largest magnitude of a power [dBm] or gain [dB]; a listed code above it counts as a code whatever its sign."""
+"""Largest magnitude of a power [dBm] or gain [dB]. A listed code with a larger magnitude is a code regardless of its
+sign."""
 
 
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
-    """Find the codes that stand for a missing value among values [n], such as powers [dBm], in ascending order.
+    """Find the codes for missing values among values [n], such as powers [dBm], in ascending order.
 
-    A number counts as a code if it is in `CODES`, is far from all other values, and has the opposite sign or an
-    impossible magnitude, above `largest`: 100 is a code among powers, but a value among path losses.
+    A number is a code if it is in `CODES`, is far from all other values, and either has the opposite sign or a
+    magnitude above `largest`. For example, 100 is a code among powers, but a value among path losses.
 
     Example:
         >>> find_codes([-70.0, 100.0, -200.0]), find_codes([70.0, 100.0, 130.0])
@@ -247,10 +254,10 @@ def without_codes(column: pd.Series) -> pd.Series:
 def mask_codes(
     table: SourceTable, columns: Sequence[str], stated: Sequence[float] = ()
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
-    """Replace the codes in columns of measured values by missing values, and record how many were replaced.
+    """Replace the codes in columns of measured values by missing values, and record the number of replaced codes.
 
-    Codes are detected in all columns together, which must contain the same quantity; `stated` codes always apply.
-    Returns the table, and a mask of the rows that contained a code [rows].
+    Codes are detected in all columns together, which must therefore contain the same quantity. The `stated` codes are
+    always replaced. The table and a mask of the rows that contained a code [rows] are returned.
 
     Raises:
         InputError: A column does not exist.
@@ -266,12 +273,12 @@ def mask_codes(
         if coded[:, index].any()
     }
     present = ", ".join(f"{code:g}" for code in codes if (values == code).any())
-    table = table.assign(**changed).note(f"values that mean not measured ({present})", int(coded.sum()))
+    table = table.assign(**changed).note(f"codes for missing values ({present})", int(coded.sum()))
     return table, np.asarray(coded.any(axis=1))
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """The numbers in a column [rows]; NaN for text, which a later step refuses with its row when it uses the values."""
+    """The numbers in a column [rows]; NaN for text, which a later step refuses if it uses the values."""
     if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
         return np.full(len(column), np.nan)
     return pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)

@@ -1,4 +1,4 @@
-"""Rows of a table with their line numbers in the file, so that messages can name file, row and column."""
+"""Rows of a table with line numbers, so that messages can name file, row and column."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibray.measurements.filters import evaluate
 from calibray.support.messages import did_you_mean, shortened
 
 Coordinates = Sequence[float | str]
-"""x, y and z [m], or longitude, latitude [deg] and height [m]; each a number or the name of a column."""
+"""x, y and z [m], or longitude, latitude [deg] and height [m]. Each coordinate is a number or the name of a column."""
 
 _DEGREES: Final = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
 
@@ -27,12 +27,13 @@ class SourceTable:
 
     Attributes:
         frame: The rows.
-        row: Line number of each row in its CSV file (a header in the first line is line 1) or sheet; for other tables,
-            numbers from 1 [rows].
-        source: Name of the file, or another name for messages.
-        changes: Changes by earlier steps, such as rows left out or averaged, each with the number of rows affected.
-        joined: For each column from another table: that table's name, the column's name there, and the column of labels
-            that found its rows.
+        row: Line number of each row in the CSV file (a header in the first line is line 1) or in the sheet [rows]. In
+            other tables, rows are numbered from 1.
+        source: Name of the file, or another name of the table in messages.
+        changes: Changes made by earlier steps, such as exclusion or averaging of rows, each with the number of affected
+            rows.
+        joined: For each column from another table, the name of that table, the name of the column in it, and the column
+            of labels by which the tables were joined.
     """
 
     frame: pd.DataFrame
@@ -57,25 +58,26 @@ class SourceTable:
         return replace(self, changes={**self.changes, change: int(number)})
 
     def select(self, mask: NDArray[np.bool_]) -> SourceTable:
-        """The rows where a mask [rows] is true."""
+        """The rows for which a mask [rows] is true."""
         return replace(self, frame=self.frame.loc[mask].reset_index(drop=True), row=self.row[mask])
 
     def keep(self, mask: NDArray[np.bool_], reason: str) -> SourceTable:
-        """The rows where a mask [rows] is true; `changes` records the reason with the number of rows removed.
+        """The rows for which a mask [rows] is true. `changes` records the reason and the number of removed rows.
 
         Raises:
             InputError: No row remains.
         """
         if not mask.any():
-            raise InputError(f"{self.source}: {reason}: all of {len(self)} rows; change [links] in the study")
+            raise InputError(f"{self.source}: {reason}: all {len(self)} rows; change [links] in the study")
         lost = int((~mask).sum())
         return (self.note(reason, lost) if lost else self).select(mask)
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Mask [rows] of the rows that pass a filter (see `filters`); missing values pass only `!=` and `not in`.
+        """Mask [rows] of the rows that pass a filter (see `filters`). Missing values pass only `!=` and `not in`.
 
         Raises:
-            InputError: The expression is malformed, names an unknown column, or does not give one truth value per row.
+            InputError: The expression is malformed, names an unknown column, or does not result in one truth value per
+                row.
         """
         try:
             return evaluate(expression, self.frame)
@@ -95,7 +97,7 @@ class SourceTable:
         return self.frame[name]
 
     def numbers(self, source: str | float, gaps: bool = False) -> NDArray[np.float64]:
-        """A column as finite numbers [rows], or one number repeated for all rows; with `gaps`, missing values are NaN.
+        """A column as finite numbers [rows], or a number repeated for all rows. With `gaps`, missing values are NaN.
 
         Raises:
             InputError: There is no such column, or a value is missing, infinite or not a number.
@@ -121,7 +123,7 @@ class SourceTable:
             value = column.iloc[first]
             remedy = "correct it"
             if str(value).strip().startswith(("<", "≤")):
-                remedy = "write the limit itself, and state links.noise_floor_dbm"
+                remedy = "write the limit without this sign, and state links.noise_floor_dbm"
             elif re.fullmatch(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?", str(value).strip()):
                 remedy = "remove the separators of thousands"
             raise InputError(f"{self.cell(first, source)}: {value!r} is not a number; {remedy}")
@@ -134,12 +136,12 @@ class SourceTable:
                 listed = ", ".join(map(str, labels[:5])) + (", ..." if len(labels) > 5 else "")
                 raise InputError(
                     f"{file}: column {name!r} is missing or not finite for {key} {listed} ({unusable.sum()} of "
-                    f"{len(self)} rows of {self.source}); correct it, or remove these rows"
+                    f"{len(self)} rows of {self.source}); correct the values, or remove these rows"
                 )
             rows = ", ".join(map(str, self.row[unusable][:5])) + (", ..." if unusable.sum() > 5 else "")
             raise InputError(
-                f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} "
-                f"rows (row {rows}); correct them, or remove these rows"
+                f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} rows "
+                f"(row {rows}); correct the values, or remove these rows"
             )
         return numbers
 
@@ -156,7 +158,8 @@ class SourceTable:
         if (missing := column.isna().to_numpy()).any():
             first = int(np.flatnonzero(missing)[0])
             raise InputError(
-                f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give a label"
+                f"{self.cell(first, names)}: the label is missing ({missing.sum()} missing labels in total); add the "
+                "label"
             )
         if pd.api.types.is_float_dtype(column):
             # A label must not depend on other rows: if another row is empty or has 0.9, pandas stores 26 as 26.0.
@@ -164,10 +167,11 @@ class SourceTable:
         return column.astype(str).to_numpy(dtype=np.str_)
 
     def positions(self, end: str, coordinates: Coordinates) -> NDArray[np.float64]:
-        """Positions [rows, 3], [m], in the scene's frame, from three numbers or columns; `end` is "tx" or "rx".
+        """Positions [rows, 3], [m], in the scene frame, from three numbers or columns; `end` is "tx" or "rx".
 
         Raises:
-            InputError: There are not three coordinates, or a column is missing, not numeric or named like degrees.
+            InputError: There are not three coordinates, or a column is missing, not numeric, or named as longitude or
+                latitude.
         """
         if isinstance(coordinates, str) or len(coordinates) != 3:
             raise InputError(f"{end} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
@@ -175,8 +179,8 @@ class SourceTable:
             if isinstance(coordinate, str):
                 if _DEGREES & set(re.split(r"[^a-z]+", coordinate.lower())):
                     raise InputError(
-                        f"{self.source}: column {coordinate!r} of {end} looks like degrees; give metres in the "
-                        "scene's frame, or set position = 'geographic' in a study"
+                        f"{self.source}: column {coordinate!r} of {end} appears to be in degrees; give metres in the "
+                        "scene frame, or set position = 'geographic' in a study"
                     )
             elif isinstance(coordinate, bool) or not np.isfinite(coordinate):
                 raise InputError(
@@ -185,7 +189,7 @@ class SourceTable:
         return np.stack([self.numbers(coordinate) for coordinate in coordinates], axis=1)
 
     def cell(self, index: int, column: str) -> str:
-        """The file, row and column of a cell, as text for messages."""
+        """The file, row and column of a cell, formatted for messages."""
         if column in self.joined:
             file, name, key = self.joined[column]
             return f"{file}, {key} {self.frame[key].iloc[index]}, column {name!r}"

@@ -1,7 +1,7 @@
 """Read tables from CSV, Parquet and Excel files.
 
 The first sheet of a workbook is converted to CSV text, so that one parser reads both formats. Sheets are read row by
-row, so a sheet whose only value is in the last row and column needs no more memory than other sheets.
+row, so a sheet with a single value in the last row and column does not require more memory than other sheets.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 
 
 def sheet_text(path: Path) -> tuple[list[int], str]:
-    """Read the first sheet of a workbook as CSV text, and the row number of each row that is not blank.
+    """Read the first sheet of a workbook as CSV text, with the row number of each row that is not blank.
 
-    A formula is replaced by its last computed value; without one, it remains text, which is refused in a column of
-    numbers. The first of several merged cells contains the value, and the others are empty. The header, which is the
-    first row, determines the columns.
+    A formula is replaced by its last computed value. Without such a value, the formula remains text, which is refused
+    in a column of numbers. The first of several merged cells contains the value, and the other cells are empty. The
+    header, which is the first row, determines the columns.
 
     Raises:
-        InputError: The file is not a workbook, contains no worksheet, is too large, or has a value in a column
-            without a name; or openpyxl is not installed.
+        InputError: The file is not a workbook, contains no worksheet, is too large, or has a value in a column without
+            a name. openpyxl is not installed.
     """
     library("openpyxl", "excel")
     try:
@@ -71,13 +71,13 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
 
 
 def _check_archive(path: Path) -> bool:
-    """Refuse a workbook that is too large or has rows out of order; return whether it contains formulas."""
+    """Check that a workbook is not too large and has rows in order; return whether it contains formulas."""
     with zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_UNPACKED:
             raise InputError(
-                f"{path}: {size / 2**20:,.0f} MiB unpacked, must be at most {MAX_UNPACKED // 2**20}; save the sheet "
-                "as CSV"
+                f"{path}: {size / 2**20:,.0f} MiB unpacked, must be at most {MAX_UNPACKED // 2**20} MiB; save the "
+                "sheet as CSV"
             )
         sheets = [archive.read(name) for name in archive.namelist() if name.startswith("xl/worksheets/")]
     for sheet in sheets:
@@ -86,7 +86,7 @@ def _check_archive(path: Path) -> bool:
 
 
 def _check_row_order(path: Path, sheet: bytes) -> None:
-    """Refuse rows that are not in ascending order: openpyxl drops repeated rows and spends hours filling gaps."""
+    """Refuse rows in non-ascending order, because openpyxl drops repeated rows and takes hours to fill gaps."""
     previous = 0
     for text in _ROW.findall(sheet):
         number = int(text) if text.isdigit() and len(text) < 10 else 0
@@ -100,7 +100,7 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
 
 
 def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
-    """Number and cells of each row that is not blank, up to its last value, as computed values or as formulas."""
+    """Number and cells of each row that is not blank, up to the last value, as computed values or formulas."""
     import openpyxl
 
     # The file is opened here because openpyxl does not close files that it cannot read.
@@ -109,7 +109,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
         closing(openpyxl.load_workbook(file, read_only=True, data_only=computed)) as book,
     ):
         if not book.worksheets:
-            raise InputError(f"{path}: contains no worksheet; put the table into the first sheet")
+            raise InputError(f"{path}: contains no worksheet; store the table in the first sheet")
         sheet = book.worksheets[0]
         sheet.reset_dimensions()  # The dimensions stated in a sheet may be wrong.
         count = 0
@@ -123,7 +123,7 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
 
 
 def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
-    """A row of computed values; cells without a computed value contain their formula as text."""
+    """A row of computed values. Cells without a computed value contain the formula as text."""
     padded = (*values, *[None] * (len(formulas) - len(values)))
     return tuple(
         formula if value is None and str(formula).startswith("=") else value
@@ -132,7 +132,7 @@ def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
 
 
 def _below_header(path: Path, rows: list[tuple[int, _Cells]]) -> list[tuple[int, _Cells]]:
-    """Rows truncated or padded to the named columns of the header, which is the first row."""
+    """Rows truncated or padded to the named columns of the header (the first row)."""
     if not rows:
         return rows
     header_row, header = rows[0]
@@ -143,8 +143,8 @@ def _below_header(path: Path, rows: list[tuple[int, _Cells]]) -> list[tuple[int,
         if stray:
             raise InputError(
                 f"{path}, row {number}: {str(cells[stray[0]])[:60]!r} is in column {stray[0] + 1}, which has no name "
-                f"in row {header_row}; the first sheet must contain only the table, with the column names in its "
-                "first row"
+                f"in row {header_row}; the first sheet must contain only the table, with the column names in the first "
+                "row"
             )
         table.append((number, tuple(cells[index] if index < len(cells) else None for index in named)))
     return table
@@ -155,13 +155,14 @@ def _has_value(cell: Any) -> bool:
 
 
 LARGEST_ROW_GROUP: Final = 2**30
-"""Largest decompressed size of a row group, or of a piece, when a Parquet file is read in pieces [bytes]."""
+"""Largest decompressed size of a row group or piece of a Parquet file that is read in pieces [bytes]."""
 
 LARGEST_TABLE: Final = 2 * LARGEST_ROW_GROUP
-"""Largest decompressed size of a Parquet file that is read as a whole [bytes]; pandas needs up to twice this memory."""
+"""Largest decompressed size of a Parquet file that is read as a whole [bytes]; pandas requires up to twice this
+memory."""
 
 DECODING_MEMORY: Final = 2 * LARGEST_TABLE
-"""Limit on the address space of the process that first decodes a Parquet file [bytes]."""
+"""Limit of the address space of the process that first decodes a Parquet file [bytes]."""
 
 PIECE_ROWS: Final = 100_000
 """Largest number of rows of a Parquet file that are read together."""
@@ -198,18 +199,18 @@ except Exception as error:
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
-"""Programs that have already run without error, each with the state of its file at that time."""
+"""Programs that have run without error, each with the state of the file at that time."""
 
 
 def read_table(path: str | Path) -> SourceTable:
     """Read a .csv, .txt, .tsv, .dat or .parquet file, or the first sheet of an .xlsx file, without blank lines.
 
     The columns of a text are separated by commas, semicolons, tabs or spaces. If the separator is not a comma, numbers
-    may have decimal commas. `parse_text` describes which lines are skipped.
+    can have decimal commas. See `parse_text` for the lines that are skipped.
 
     Raises:
-        InputError: The file does not exist, has another extension, is empty or malformed, or the library that reads it
-            (pyarrow, openpyxl) is not installed.
+        InputError: The file does not exist, has a different extension, or is empty or malformed. The library that reads
+            the file (pyarrow or openpyxl) is not installed.
     """
     path = as_path(path, "table")
     if not exists(path):
@@ -237,12 +238,12 @@ def read_table(path: str | Path) -> SourceTable:
 @final
 @dataclass(frozen=True, eq=False)
 class PiecedTable:
-    """A table that is read in pieces, so that a large Parquet file is never entirely in memory.
+    """A table that is read in pieces, so that a large Parquet file is never loaded entirely.
 
     Attributes:
         source: Name of the file.
         rows: Number of rows.
-        whole: All rows, if the file's format does not support reading in pieces; None for Parquet.
+        whole: All rows, if the file format does not support reading in pieces; None for Parquet.
     """
 
     source: str
@@ -251,7 +252,7 @@ class PiecedTable:
 
     @classmethod
     def open(cls, path: str | Path) -> PiecedTable:
-        """Open a CSV, Parquet or Excel file; CSV and Excel files are read immediately.
+        """Open a CSV, Parquet or Excel file. CSV and Excel files are read immediately.
 
         Raises:
             InputError: As for `read_table`.
@@ -271,7 +272,7 @@ class PiecedTable:
         return cls(str(path), rows, None)
 
     def pieces(self, size: int) -> Iterator[SourceTable]:
-        """Yield the rows in file order, in pieces of at most `size` rows; a column has the same type in all pieces.
+        """Yield the rows in file order, in pieces of at most `size` rows. A column has the same type in all pieces.
 
         Raises:
             InputError: The file is damaged.
@@ -314,10 +315,10 @@ def _read_parquet(path: Path) -> SourceTable:
 
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
-    """The declared size of row groups [bytes]; it is checked because kilobytes may decompress to gigabytes.
+    """The declared size of row groups [bytes], which is checked because kilobytes can decompress to gigabytes.
 
     Raises:
-        InputError: The size exceeds the limit or the memory.
+        InputError: The size exceeds the limit or the available memory.
     """
     # A column of one repeated value takes almost no space in the file, but eight bytes for each row in memory.
     size = sum(
@@ -327,30 +328,31 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
     )
     if size > min(limit, available_memory()):
         raise InputError(
-            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, must take at most {limit / 2**30:g} GiB and "
-            "fit into the free memory; keep only the columns and rows that you need, or write smaller row groups"
+            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, more than the limit of {limit / 2**30:g} GiB "
+            "or the free memory; keep only the required columns and rows, or write smaller row groups"
         )
     return size
 
 
 def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
-    """Decode a Parquet file in a limited process, as pages may be larger than declared, and rows may repeat one text.
+    """Decode a Parquet file in a process with limits, because its content can be larger than declared.
 
-    `size` is the declared size, and `limit` is the largest size of the rows in memory, both in bytes. The limit applies
-    to the table if `whole`, and otherwise to each piece.
+    Pages can be larger than declared, and rows can repeat one text. `size` is the declared size, and `limit` is the
+    largest size of the rows in memory, both in bytes. The limit applies to the table if `whole`, and otherwise to each
+    piece.
 
     Raises:
-        InputError: The file needs more memory or time, or is damaged.
+        InputError: The file requires more memory or time, or is damaged.
     """
     code = _DECODE.format(path=str(path.resolve()), limit=limit, whole=whole, rows=PIECE_ROWS)
     _run_elsewhere(path, code, size)
 
 
 def _run_elsewhere(path: Path, code: str, size: int) -> None:
-    """Run a program on a file in a process with limits, once for each program and state of the file.
+    """Run a program on a file in a process with limits, once per program and state of the file.
 
     Raises:
-        InputError: The file needs more memory or time, or is damaged.
+        InputError: The file requires more memory or time, or is damaged.
     """
     status = path.stat()
     key = (code, status.st_mtime_ns, status.st_size, status.st_ino)
@@ -363,7 +365,9 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
     except TimeoutError as error:
         raise InputError(f"{path}: cannot be decompressed {error}; export it again") from None
     if not is_read:
-        raise InputError(f"{path}: the library that reads Parquet files crashes on it; export it again")
+        raise InputError(
+            f"{path}: the library that reads Parquet files crashes while reading this file; export it again"
+        )
     _decoded.add(key)
 
 
@@ -388,7 +392,7 @@ def _next_frame(path: Path, batches: Iterator[Any]) -> Any:
 
 
 def _without_decimals(frame: pd.DataFrame) -> pd.DataFrame:
-    """A table with floats in place of the decimal numbers that databases export, which pandas keeps as objects."""
+    """A table with floats instead of the decimal numbers of database exports, which pandas stores as objects."""
     names = [name for name in frame if pd.api.types.infer_dtype(frame[name], skipna=True) == "decimal"]
     return frame.astype(dict.fromkeys(names, np.float64))
 
@@ -409,7 +413,7 @@ def _integer_columns_with_gaps(file: Any) -> list[str]:
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
-    """The error for a Parquet file that its library cannot read."""
+    """The error for a Parquet file that pyarrow cannot read."""
     if isinstance(error, MemoryError):
-        return InputError(f"{path}: does not fit into memory; keep only the columns and rows that you need")
+        return InputError(f"{path}: does not fit into memory; keep only the required columns and rows")
     return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")

@@ -1,7 +1,7 @@
 """Find the columns that describe transmitters.
 
-Such a column names the transmitter in a table of links or of transmitters, contains the values of one transmitter, or
-describes transmit antennas. Planning tools and operators use different names for these columns.
+Such a column contains the names of transmitters in a table of links or transmitters, contains the values of one
+transmitter, or describes transmit antennas. Planning tools and operators use different names for these columns.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from calibray.measurements.column_names import WATTS, is_named_value, matches, n
 from calibray.measurements.selection import comparison, naming_column
 
 MAX_DEVICES: Final = 12
-"""Largest number of receiving devices; a column with more values probably contains something else, such as a
+"""Largest number of receiving devices. A column with more values probably contains a different quantity, such as a
 location."""
 
 
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
     """Find the columns of a wide table, and the transmitter of each column.
 
-    The names of these columns differ only in the transmitter's name, which is delimited by separators. If there are
-    several quantities, received power or path loss is chosen. The result is empty for fewer than two such columns.
+    The names of these columns differ only in the name of the transmitter, which is delimited by separators. If there
+    are several quantities, received power or path loss is chosen. The result is empty if there are fewer than two such
+    columns.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
@@ -53,7 +54,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 
 
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
-    """Find columns of a wide table that are named like transmitters' columns but match no known transmitter.
+    """Find columns of a wide table that have names like those of transmitters but match no known transmitter.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
@@ -72,7 +73,7 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
-    """Name the column into which the columns of a wide table are combined, after a word that they share.
+    """Name for the column into which the columns of a wide table are combined, based on a word in all column names.
 
     Example:
         >>> name_melted_values(["RSS AP1", "RSS AP2"])
@@ -84,10 +85,11 @@ def name_melted_values(columns: Iterable[str]) -> str:
 
 
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """Find the common column that names the transmitter in both tables; None if there is none.
+    """Find the column with the name of the transmitter in both tables; None without such a column.
 
-    In the table of transmitters, its values are distinct. The first such column that contains all values of the links
-    is chosen; otherwise the first one that is named like a transmitter and shares at least one value with the links.
+    Its values in the table of transmitters are distinct. The first such column that contains all values of the links is
+    chosen. Otherwise, the first such column is chosen that has the name of a transmitter column and shares a value with
+    the links.
     """
     partial = None
     for name in transmitters:
@@ -104,9 +106,9 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 
 
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
-    """Find the column of the links that names the transmitter, and its counterpart in the table of transmitters.
+    """Find the column of transmitter names in the links, and the corresponding column in the table of transmitters.
 
-    Columns that are named like transmitters are tried first, then other text columns.
+    Columns with a name that indicates transmitters are tried first, followed by other text columns.
 
     Example:
         >>> links = pd.DataFrame({"gateway_id": ["a", "b", "a"], "rssi": [-80, -90, -85]})
@@ -124,9 +126,9 @@ def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[st
 
 
 def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
-    """Find the column that names the transmitters whose positions are in the same table.
+    """Find the column with the names of transmitters that have positions in the same table.
 
-    Each of its labels has a single position, and there are at least as many labels as positions.
+    Each label in this column has a single position.
 
     Example:
         >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
@@ -162,14 +164,14 @@ def find_transmitter_names(transmitters: pd.DataFrame) -> list[str]:
     ]
     if not names:
         raise InputError(
-            f"transmitters: no column contains distinct names ({', '.join(map(str, transmitters))}); call one "
-            "'transmitter'"
+            f"transmitters: no column contains distinct names ({', '.join(map(str, transmitters))}); name such a "
+            "column 'transmitter'"
         )
     return names
 
 
 def find_devices(frame: pd.DataFrame) -> list[str]:
-    """Columns whose values may distinguish receiving devices."""
+    """Columns with values that can distinguish receiving devices."""
     quantities = (
         "x", "y", "longitude", "latitude", "height", "altitude or floor", "azimuth", "downtilt", "path gain", "power",
         "received power", "path loss", "decibel", "frequency", "bandwidth or shift", "time", "distance",
@@ -193,8 +195,8 @@ POWERS: Final = (-30.0, 100.0)
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
     """Find the columns of azimuth, mechanical and electrical downtilt, by key of ``[links.tx_antenna]``.
 
-    A downtilt whose name states no kind counts as mechanical; columns with the sum of both tilts are ignored. If the
-    rows are not transmitters, the names must state that the antenna is a transmitter's.
+    A downtilt column without a stated kind is treated as mechanical. Columns with the sum of both tilts are ignored. If
+    the rows are not transmitters, the column names must indicate a transmitter or an antenna.
 
     Example:
         >>> frame = pd.DataFrame(columns=["Azimuth (°)", "Mechanical Downtilt (°)", "E-Tilt", "Total Tilt"])
@@ -220,20 +222,21 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
 
 
 def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
-    """The reason why a column cannot contain the angle of each transmitter; empty if it can."""
+    """The reason why a column cannot contain the angles of the transmitters; empty if it can."""
     values = pd.to_numeric(frame[column], errors="coerce")
     missing = int(values.isna().sum())
     if missing or column not in numeric_columns(frame):
-        return (
-            f"{missing or len(frame)} of {len(frame)} rows contain no number; fill them in and state the key"
-        )
+        return f"{missing or len(frame)} of {len(frame)} rows contain no number; add the numbers and state the key"
     if values.abs().max() > LARGEST_ANGLE[key]:
         return f"the value {values.abs().max():g} is not an angle in degrees"
     return ""
 
 
 def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | None:
-    """Column with the name of each antenna's model or file; if several exist, the one with the most `known` names."""
+    """Column with the names of antenna models or files.
+
+    Of several columns, the one with the most `known` names is chosen.
+    """
     texts = [str(name) for name in frame if not pd.api.types.is_bool_dtype(frame[name])]
     names = [name for name in texts if matches(name, "antenna") and name not in numeric_columns(frame)]
     stems = {plain_name(name) for name in known}
@@ -245,7 +248,7 @@ def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | 
 
 
 def plain_name(label: object) -> str:
-    """An antenna's name in lower case, without punctuation and file extension.
+    """The name of an antenna in lower case, without punctuation and file extension.
 
     Example:
         >>> plain_name("80010677_0824 X-CO.MSI") == plain_name("80010677 0824_x_co")
@@ -258,7 +261,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Column of EIRP, or else of transmitted power [dBm], in a table of transmitters, by key of ``[links]``."""
+    """Column of EIRP, or else of transmitted power [dBm], in a table of transmitters, by the key in ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)

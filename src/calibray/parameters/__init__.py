@@ -1,4 +1,4 @@
-"""Parameters: the quantities that a calibration may change, their search space, and their laws over frequency."""
+"""Parameters: the quantities that a calibration changes, their search space and their frequency laws."""
 
 from calibray.parameters.parameter import SCATTERING_SPREAD as SCATTERING_SPREAD
 from calibray.parameters.parameter import Parameter as Parameter

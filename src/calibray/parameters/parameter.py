@@ -1,8 +1,8 @@
-"""One parameter: its name, its bounds, its start value in a scene, and the law over frequency to which it may belong.
+"""A single parameter: name, bounds, start value in a scene, and frequency law.
 
-Constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], f in GHz (ITU-R P.2040). A material that ITU-R
-lists has the coefficients of Table 3. Any other material has constants that do not depend on frequency: the same law
-with exponents of 0.
+The constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], with f in GHz (ITU-R P.2040). An ITU-R
+material has the coefficients of Table 3. The constants of any other material are independent of frequency, as in the
+same law with exponents of 0.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _PATTERN_FIELDS: Final = ("alpha_r", "alpha_i", "lambda_")
 LAWS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {"relative_permittivity": ("itu_a", "itu_b"), "conductivity": ("itu_c", "itu_d")}
 )
-"""Constants that may depend on frequency, each with the parameters of its law: coefficient and exponent."""
+"""Constants that can depend on frequency, each with the coefficient and exponent of its law."""
 
 CONSTANT_OF_FIELD: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -48,7 +48,7 @@ CONSTANT_OF_FIELD: Final[Mapping[str, str]] = MappingProxyType(
         **{coefficient: constant for constant, law in LAWS.items() for coefficient in law},
     }
 )
-"""Fields that a parameter may set, each with the constant of the material that it changes."""
+"""Fields that a parameter can set, each with the material constant that it changes."""
 
 EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
     {
@@ -62,11 +62,11 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
         "rx": {"dx": Bound(-1000.0, 1000.0, "m"), "dy": Bound(-1000.0, 1000.0, "m")},
     }
 )
-"""Kinds of effects other than materials that have parameters, as in "region:trees.specific_attenuation", with the
+"""Kinds of effects that have parameters but are not materials, as in "region:trees.specific_attenuation", with the
 physical bounds of each field."""
 
 ROUGHNESS: Final = "roughness_mm"
-"""Field of a material that acts as an effect on paths instead of as a constant: its roughness."""
+"""Field of a material that represents an effect on paths instead of a constant."""
 
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
@@ -79,26 +79,27 @@ PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         **{field: bound for fields in EFFECTS.values() for field, bound in fields.items()},
     }
 )
-"""Physical bounds of each field; `check_law` checks the value of a law."""
+"""Physical bounds of each field. `check_law` checks the values of laws."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One calibrated number: a field of a material or of an effect, with its bounds and its start value.
+    """One calibrated number: a field of a material or effect, with bounds and start value.
 
     Attributes:
-        name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are the constants of a
-            material, its `roughness_mm`, and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d
-            [S/m], f in GHz. For other effects, the kind precedes a colon: "region:trees.specific_attenuation".
-        lower: Lower bound, in the field's unit.
-        upper: Upper bound, in the field's unit.
-        start: Value before calibration, within the bounds, in the field's unit.
-        scale: "linear", or "log" for a constant that spans decades; then `lower` must be greater than 0.
-        at_lower: Length of an interval of the search space that maps to the value `lower`; with a prior, exactly this
-            value then has a finite probability.
+        name: Material and field, separated by the last dot: "walls.relative_permittivity". Fields are the constants of
+            a material, `roughness_mm`, and the coefficients `itu_a` to `itu_d` of the law of ITU-R P.2040: eps_r = a
+            f^b, sigma = c f^d [S/m], with f in GHz. For other effects, the kind precedes a colon:
+            "region:trees.specific_attenuation".
+        lower: Lower bound, in the unit of the field.
+        upper: Upper bound, in the unit of the field.
+        start: Value before calibration, within the bounds, in the unit of the field.
+        scale: "linear", or "log" for a constant that spans decades and has a positive lower bound.
+        at_lower: Length of an interval of the search space that maps to the value `lower`. With a prior, this value
+            then has a non-zero probability.
 
     Raises:
-        InputError: The field is unknown, or bounds or start are out of order or physically impossible.
+        InputError: The field is unknown, or the bounds or the start value are out of order or physically impossible.
 
     Example:
         >>> Parameter("walls.relative_permittivity", lower=1.5, upper=12.0, start=5.0).material
@@ -123,13 +124,13 @@ class Parameter:
         if self.lower >= self.upper:
             fault = "equal" if self.lower == self.upper else "reversed"
             raise InputError(
-                f"{self.name}: bounds = [{self.lower}, {self.upper}] are {fault}; the lower must be less "
-                "than the upper; to fix a constant, give it under [materials] instead"
+                f"{self.name}: bounds = [{self.lower}, {self.upper}] are {fault}; the lower bound must be less than "
+                "the upper bound; to fix a constant, state it in [materials] instead"
             )
         if not self.lower <= self.start <= self.upper:
             raise InputError(
-                f"{self.name}: start = {self.start:g} lies outside bounds = [{self.lower:g}, {self.upper:g}];"
-                " widen them or give another start"
+                f"{self.name}: start = {self.start:g} is outside bounds = [{self.lower:g}, {self.upper:g}]; widen the "
+                "bounds or change the start value"
             )
         if self.scale not in get_args(Scale):
             raise InputError(
@@ -137,8 +138,8 @@ class Parameter:
             )
         if self.scale == "log" and self.lower <= 0:
             raise InputError(
-                f"{self.name}: scale = 'log' with lower bound {self.lower:g}: the lower bound must be "
-                "greater than 0, or the scale 'linear'"
+                f"{self.name}: scale = 'log' with lower bound {self.lower:g}: the lower bound must be greater than 0, "
+                "or the scale must be 'linear'"
             )
 
     @property
@@ -148,31 +149,31 @@ class Parameter:
 
     @property
     def field(self) -> str:
-        """The field's name, one of `CONSTANT_OF_FIELD`."""
+        """The name of the field, one of `CONSTANT_OF_FIELD`."""
         return split_name(self.name)[1]
 
     @property
     def constant(self) -> str:
-        """The constant of the material that it changes, one of `FIELDS`; for an effect, the field itself."""
+        """The material constant that the parameter changes, one of `FIELDS`; for an effect, the field itself."""
         return CONSTANT_OF_FIELD.get(self.field, self.field)
 
     @property
     def is_effect(self) -> bool:
-        """Whether it belongs to an effect and not to a material."""
+        """Whether the parameter belongs to an effect instead of a material."""
         return is_effect(self.name)
 
 
 SCATTERING_SPREAD: Final = 0.25
-"""Standard deviation of a scattering coefficient that is 0 in the scene, unless it is exactly 0. Facades have 0.2 to
-0.4 (V. Degli-Esposti et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
+"""Standard deviation of a scattering coefficient that is 0 in the scene, given that it is not exactly 0. Facades have
+scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
-    """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
+    """A parameter for a constant that is fixed in the scene, with bounds at four standard deviations of its logarithm.
 
-    A scattering coefficient of 0 is exactly 0 with a probability of one half. Otherwise its prior is the positive half
-    of a Gaussian with the standard deviation `SCATTERING_SPREAD`. The result is None if another constant is 0, if these
-    values are impossible, or if the spread is 0.
+    A scattering coefficient of 0 is exactly 0 with a probability of one half. Otherwise, its prior is the positive half
+    of a Gaussian distribution with the standard deviation `SCATTERING_SPREAD`. The result is None if any other constant
+    is 0, if the bounds are impossible, or if the spread is 0.
 
     Example:
         >>> fixed_constant("walls.thickness", 0.2, 0.1).upper
@@ -224,7 +225,7 @@ def split_name(name: str) -> tuple[str, str]:
     allowed = EFFECTS[name.partition(":")[0]] if _of_kind(name) else (*CONSTANT_OF_FIELD, ROUGHNESS)
     if not material:
         raise InputError(
-            f"parameter {name!r}: must be a material and a field, such as 'walls.relative_permittivity'"
+            f"parameter {name!r}: must consist of a material and a field, such as 'walls.relative_permittivity'"
         )
     if field not in allowed:
         raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, allowed)}")
@@ -238,19 +239,19 @@ def start_value(
     frequency: float,
     laws: Mapping[str, ItuLaw] | None = None,
 ) -> float:
-    """Determine the start value of a scene's parameter, in the field's unit.
+    """Determine the start value of a parameter of a scene, in the unit of the field.
 
     Args:
         name: Material and field, such as "walls.relative_permittivity".
-        start: A value in the field's unit; "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R value;
-            None for the scene's value.
-        base: The scene's materials by name.
+        start: A value in the unit of the field, a name such as "itu:concrete" or "itu:concrete@P.2040-1" for the value
+            of ITU-R P.2040, or None for the value in the scene.
+        base: The materials of the scene by name.
         frequency: Frequency [Hz] of the ITU-R laws.
-        laws: Laws of materials by name; the constants of other materials do not depend on frequency.
+        laws: Laws of materials by name. The constants of other materials are independent of frequency.
 
     Raises:
-        InputError: The scene has no such material, the field has no effect with the material's scattering pattern, the
-            start is not finite, or `itu_material` raises it.
+        InputError: The scene has no such material, the field has no effect with the scattering pattern of the material,
+            the start value is not finite, or `itu_material` raises the error.
 
     Example:
         >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
@@ -276,20 +277,20 @@ def start_value(
 
 
 def itu_start(name: str, start: str, frequency: float) -> float:
-    """Look up the value of ITU-R P.2040, in the field's unit, for a start such as "itu:concrete@P.2040-1".
+    """Look up the ITU-R P.2040 value for a start value such as "itu:concrete@P.2040-1", in the unit of the field.
 
     Raises:
-        InputError: The text has a different form, the field has no ITU-R law, or `itu_material` raises it.
+        InputError: The text has a different form, the field has no ITU-R law, or `itu_material` raises the error.
     """
     field = split_name(name)[1]
     if is_effect(name):
-        raise InputError(f"{name}: {start!r}: ITU-R P.2040 gives materials only; give a number")
+        raise InputError(f"{name}: {start!r}: ITU-R P.2040 specifies only materials; give a number")
     if not start.startswith(_ITU_PREFIX):
         raise InputError(
             f"{name}: start = {start!r}: must be a number or 'itu:NAME', such as 'itu:concrete@P.2040-1'"
         )
     if CONSTANT_OF_FIELD.get(field) not in LAWS:
-        raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 gives no {field}; give a number")
+        raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 does not specify {field}; give a number")
     itu_name, _, revision = start.removeprefix(_ITU_PREFIX).partition("@")
     try:
         if field not in FIELDS:
@@ -301,15 +302,15 @@ def itu_start(name: str, start: str, frequency: float) -> float:
 
 
 def _coefficient(law: ItuLaw, field: str) -> float:
-    """The coefficient of a law that the field `itu_a`, `itu_b`, `itu_c` or `itu_d` names."""
+    """The coefficient of a law for the field `itu_a`, `itu_b`, `itu_c` or `itu_d`."""
     return float(getattr(law, field.removeprefix("itu_")))
 
 
 def check_material(name: str, materials: Collection[str]) -> None:
-    """Reject a parameter whose material is not in the scene.
+    """Reject a parameter of a material that is not in the scene.
 
     Raises:
-        InputError: The material is not in the scene; the message suggests the nearest name.
+        InputError: The material is not in the scene. The message suggests the closest name.
     """
     material = split_name(name)[0]
     if material not in materials:
@@ -323,8 +324,8 @@ class PowerLaw(NamedTuple):
 
     Attributes:
         value: The value.
-        by_scale: Its derivative with respect to s.
-        by_exponent: Its derivative with respect to e.
+        by_scale: Derivative of the value with respect to s.
+        by_exponent: Derivative of the value with respect to e.
     """
 
     value: NDArray[np.float64]
@@ -333,7 +334,7 @@ class PowerLaw(NamedTuple):
 
 
 def power_law(scale: NDArray[np.float64], exponent: NDArray[np.float64], frequency: float) -> PowerLaw:
-    """Evaluate s f^e at one frequency [Hz] for scales s [...], in the constant's unit, and exponents e [...]."""
+    """Evaluate s f^e, with f in GHz, at one frequency [Hz] for scales s [...] and exponents e [...]."""
     frequency_ghz = frequency / 1e9
     power = frequency_ghz**exponent
     value = scale * power  # ITU-R P.2040-1 eq. 58 and 59
@@ -349,17 +350,17 @@ def check_law(
 ) -> None:
     """Reject bounds of a law s f^e that allow an impossible value of a constant at any of the carriers [Hz].
 
-    A power law is monotonic in both coefficients, so it is enough to check the corners of their bounds. A fixed
-    coefficient has a single value.
+    A power law is monotonic in both coefficients, so only the corners of the bounds are checked. A fixed coefficient
+    has a single value.
 
     Raises:
-        InputError: s f^e lies outside the constant's bound.
+        InputError: s f^e is outside the bounds of the constant.
     """
     scale_name, exponent_name = LAWS[constant]
     for frequency, scale, exponent in product(frequencies, scales, exponents):
         value = float(power_law(np.array(scale), np.array(exponent), frequency).value)
         if value not in BOUNDS[constant]:
             raise InputError(
-                f"{material}.{scale_name} = {scale:g} with {exponent_name} = {exponent:g} gives "
-                f"{constant} = {value:.4g} at {frequency / 1e9:g} GHz, must be {BOUNDS[constant]}; narrow the bounds"
+                f"{material}.{scale_name} = {scale:g} with {exponent_name} = {exponent:g} results in {constant} = "
+                f"{value:.4g} at {frequency / 1e9:g} GHz, must be {BOUNDS[constant]}; narrow the bounds"
             )

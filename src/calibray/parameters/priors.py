@@ -1,4 +1,4 @@
-"""Priors of parameters: log-normal around a value, Gaussian for antennas, or centred on another parameter."""
+"""Priors of parameters: log-normal around a value or another parameter, or Gaussian."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from calibray.parameters.space import Parameters
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Gaussian priors of the logarithms of k parameters, or, for those in `linear`, of their values.
+    """Gaussian priors of the logarithms of k parameters, or of the values of the parameters in `linear`.
 
     Attributes:
         index: Indices of the parameters that have a prior.
-        centre: Medians, in the parameters' units; for those in `like`, relative to the value of the other parameter.
-        spread: Standard deviations of the logarithms (0.3 is about 30 %), or of the values of those in `linear`.
-        linear: Indices of the parameters whose prior is Gaussian in the value itself, which can be negative.
-        like: Pairs of indices: a parameter with a prior, and the parameter on which the prior is centred. Members of a
-            population scatter around their common value.
+        centre: Medians, in the units of the parameters. For parameters in `like`, medians are relative to the other
+            parameter.
+        spread: Standard deviations of the logarithms (0.3 corresponds to about 30 %), or of the values of parameters in
+            `linear`.
+        linear: Indices of the parameters with a Gaussian prior of the value, which can be negative.
+        like: Pairs of indices of a parameter and the parameter on which its prior is centred. Members of a population
+            scatter around a common value.
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
@@ -42,9 +44,9 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, and independent priors of further parameters whose logarithms have the same spread.
+        """These priors, and independent priors of further parameters with the same spread of the logarithm.
 
-        Scattering coefficients centred on 0 have the standard deviation `SCATTERING_SPREAD`.
+        The priors of scattering coefficients that are centred on 0 have the standard deviation `SCATTERING_SPREAD`.
         """
         return replace(
             self,
@@ -60,7 +62,7 @@ class LogNormal:
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Least-squares residuals of the priors: (log value - log centre) / spread [n, k].
 
-        Candidates [n, d] are in the fields' units, greater than 0 unless `linear`.
+        Candidates [n, d] are in the units of the fields. Values are positive, except for parameters in `linear`.
         """
         values, centre, linear = candidates[:, self._columns], np.array(self.centre), self._linear
         logarithm = np.log(np.where(linear, 1.0, values)) - np.log(np.where(linear, 1.0, centre))
@@ -70,7 +72,10 @@ class LogNormal:
         return np.where(linear, values - centre, logarithm) / self.spread
 
     def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the residuals with respect to the parameters [n, k, d]; arguments as for `residuals`."""
+        """Derivatives of the residuals with respect to the parameters [n, k, d].
+
+        The arguments are those of `residuals`.
+        """
         jacobian = np.zeros((len(candidates), len(self), candidates.shape[1]))
         slope = np.where(self._linear, 1.0, candidates[:, self._columns])
         jacobian[:, np.arange(len(self)), self._columns] = 1.0 / (slope * self.spread)
@@ -83,8 +88,8 @@ class LogNormal:
     ) -> NDArray[np.float64]:
         """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
 
-        The integral depends on the parameters on which these priors are centred. The density refers to the search
-        space.
+        The integral depends on the parameters on which these priors are centred. The integration variables are the
+        search coordinates.
         """
         total = np.zeros(len(candidates))
         for row, reference in self._pairs:
@@ -114,10 +119,10 @@ class LogNormal:
     def _interval(
         self, row: int, reference: NDArray[np.float64], parameters: Parameters
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Mean of the logarithm [n], and the distances of the bounds from it in standard deviations [n] each.
+        """Mean of the logarithm [n], and distance of each bound from this mean in standard deviations [n].
 
-        The last result is 1 if the search coordinate is the value itself, for which the mean of the logarithm is
-        shifted, and 0 if it is the logarithm.
+        The last result is 1 if the search coordinate is the value, for which the mean of the logarithm is shifted. The
+        last result is 0 if the search coordinate is the logarithm.
         """
         item, spread = parameters.items[self.index[row]], self.spread[row]
         tilt = 0.0 if item.scale == "log" else 1.0
@@ -127,7 +132,7 @@ class LogNormal:
 
     @property
     def _pairs(self) -> tuple[tuple[int, int], ...]:
-        """Index of each prior in `like`, and of the parameter on which it is centred."""
+        """Index of each prior in `like`, and index of the parameter on which the prior is centred."""
         return tuple((self.index.index(parameter), reference) for parameter, reference in self.like)
 
     @property

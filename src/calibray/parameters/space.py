@@ -1,4 +1,4 @@
-"""The search space of a calibration, the materials that its points describe, and the priors of its parameters."""
+"""The search space of a calibration, and the materials that the points of this space describe."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ class _Law(NamedTuple):
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a study, in the order of a candidate's components.
+    """The parameters of a study, in the order of the values of a candidate.
 
     Attributes:
         items: The parameters, at least one.
-        frequency: Carrier [Hz] at which laws are evaluated by default.
-        laws: Laws by material, for materials with a coefficient as parameter; the other coefficients keep the values
-            given here. By default, the constants of a law are the same at all frequencies.
+        frequency: Carrier frequency at which laws are evaluated by default [Hz].
+        laws: Laws by material, for materials with a coefficient as a parameter. The other coefficients are fixed at the
+            values of these laws. By default, the constants are independent of frequency.
 
     Raises:
-        InputError: There are no parameters, a name is repeated, or a constant and a coefficient of its law are both
+        InputError: There are no parameters, a name is repeated, or both a constant and a coefficient of its law are
             parameters.
 
     Example:
@@ -75,17 +75,18 @@ class Parameters:
             )
         if len(self.items) > MAX_PARAMETERS:
             raise InputError(
-                f"parameters: {len(self.items)}, must be at most {MAX_PARAMETERS}; let objects share a material"
+                f"parameters: {len(self.items)}, must be at most {MAX_PARAMETERS}; assign one material to several "
+                "objects"
             )
         counts = Counter(self.names)
         if repeated := [name for name, count in counts.items() if count > 1]:
-            raise InputError(f"parameters: {repeated[0]!r} is given twice; remove one")
+            raise InputError(f"parameters: {repeated[0]!r} is given twice; remove one of the two")
         for parameter in self.items:
             constant = _constant_name(parameter)
             if parameter.name != constant and constant in counts:
                 raise InputError(
-                    f"parameters: {constant!r} is the same at every carrier and {parameter.name!r} belongs to its law; "
-                    "remove one"
+                    f"parameters: {constant!r} is independent of frequency, but {parameter.name!r} is a coefficient of "
+                    "its law; remove one of the two"
                 )
 
     def __len__(self) -> int:
@@ -101,17 +102,17 @@ class Parameters:
 
     @property
     def lower(self) -> NDArray[np.float64]:
-        """The lower bounds [parameters], in the fields' units."""
+        """The lower bounds [parameters], in the units of the fields."""
         return np.array([parameter.lower for parameter in self.items], dtype=np.float64)
 
     @property
     def upper(self) -> NDArray[np.float64]:
-        """The upper bounds [parameters], in the fields' units."""
+        """The upper bounds [parameters], in the units of the fields."""
         return np.array([parameter.upper for parameter in self.items], dtype=np.float64)
 
     @property
     def start(self) -> NDArray[np.float64]:
-        """The start values [parameters], in the fields' units."""
+        """The start values [parameters], in the units of the fields."""
         return np.array([parameter.start for parameter in self.items], dtype=np.float64)
 
     @property
@@ -120,12 +121,12 @@ class Parameters:
         return np.array([parameter.scale == "log" for parameter in self.items])
 
     def named(self, candidate: ArrayLike) -> dict[str, float]:
-        """The values of a candidate [parameters] by the parameters' names."""
+        """The values of a candidate [parameters], by parameter name."""
         return dict(zip(self.names, self._components(candidate).tolist(), strict=True))
 
     @cached_property
     def of_effects(self) -> NDArray[np.int64]:
-        """Indices of the parameters that belong to effects, not to materials."""
+        """Indices of the parameters that belong to effects instead of materials."""
         return np.array([k for k, item in enumerate(self.items) if item.is_effect], dtype=np.int64)
 
     @cached_property
@@ -143,9 +144,10 @@ class Parameters:
     def constants_and_slopes(
         self, candidates: ArrayLike, frequency: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Constants that candidates set at one carrier, and their derivatives, each [..., parameters].
+        """Constants that candidates determine at one carrier, and their derivatives, both [..., parameters].
 
-        If None, the carrier is `frequency` of the parameters. Both coefficients of a law have the same constant.
+        If `frequency` is None, the carrier is that of the parameters. Both coefficients of a law have the same
+        constant.
 
         Raises:
             InputError: The candidates have the wrong length.
@@ -166,10 +168,10 @@ class Parameters:
         return constants, slopes
 
     def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
-        """The constants that the parameters set at one carrier [Hz], as parameters themselves.
+        """The constants that the parameters determine at one carrier [Hz], as parameters.
 
         Constants that follow a law have only physical bounds. The second result is the index of the constant that each
-        of the original parameters sets [parameters].
+        original parameter determines [parameters].
         """
         if not self.has_laws:
             return self, np.arange(len(self))
@@ -186,7 +188,7 @@ class Parameters:
         return Parameters(tuple(constants.values()), frequency), np.array(indices, dtype=np.int64)
 
     def law_coefficients(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
-        """For each material, both coefficients of every law that has a coefficient among the parameters.
+        """Both coefficients of every law with a coefficient among the parameters, by material.
 
         Raises:
             InputError: The candidate has the wrong length.
@@ -206,7 +208,7 @@ class Parameters:
         """Reject bounds of laws that allow an impossible value of a constant at any of the carriers [Hz].
 
         Raises:
-            InputError: A law exceeds the bound of its constant; the message names the carrier.
+            InputError: A law exceeds the bounds of its constant. The message names the carrier.
         """
         for law in self._laws():
             scales = (law.fixed_scale,) if law.scale is None else self._bounds(law.scale)
@@ -239,9 +241,9 @@ class Parameters:
     def materials(
         self, candidate: ArrayLike, base: Mapping[str, Material], frequency: float | None = None
     ) -> dict[str, Material]:
-        """All materials of `base`, in its order, with a candidate's values [parameters] at one carrier.
+        """All materials of `base`, in the same order, with the values of a candidate [parameters] at one carrier.
 
-        If None, the carrier is `frequency` of the parameters.
+        If `frequency` is None, the carrier is that of the parameters.
 
         Raises:
             InputError: The candidate has the wrong length, a value is physically impossible, or a material is unknown.
@@ -261,18 +263,18 @@ class Parameters:
         return {name: replace(material, **changes.get(name, {})) for name, material in base.items()}
 
     def matrix_indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row and column, in a matrix of constants [materials, fields], of each parameter of a material.
+        """Row and column of each material parameter in a matrix of constants [materials, fields].
 
-        Replay uses them to insert candidates: ``constants.at[..., rows, columns].set(candidates)``. Coefficients of
-        laws have no cell; use the parameters of `at_carrier` for them.
+        Replay uses these indices to insert candidates: ``constants.at[..., rows, columns].set(candidates)``.
+        Coefficients of laws have no cell; use the parameters of `at_carrier` instead.
 
         Raises:
-            InputError: A parameter's material is not in `materials`, or a parameter is a coefficient of a law.
+            InputError: The material of a parameter is not in `materials`, or a parameter is a coefficient of a law.
         """
         if self.has_laws:
             raise InputError(
-                f"parameters {', '.join(self.names)}: coefficients of laws have no cell in a constants matrix; take "
-                "them at a carrier"
+                f"parameters {', '.join(self.names)}: coefficients of laws have no cell in a matrix of constants; call "
+                "at_carrier first"
             )
         row_of = {name: row for row, name in enumerate(materials)}
         items = [parameter for parameter in self.items if not parameter.is_effect]
@@ -287,11 +289,11 @@ class Parameters:
     ) -> NDArray[np.float64]:
         """The constants [..., materials, fields] of candidates [..., parameters] at one carrier.
 
-        Rows are in the order of `base`, and columns in that of `FIELDS`. If None, the carrier is `frequency` of the
-        parameters.
+        Rows are in the order of `base`, and columns in the order of `FIELDS`. If `frequency` is None, the carrier is
+        that of the parameters.
 
         Raises:
-            InputError: The candidates have the wrong length, or a parameter's material is unknown.
+            InputError: The candidates have the wrong length, or the material of a parameter is unknown.
         """
         carrier = self.frequency if frequency is None else frequency
         values, _ = self.constants_and_slopes(candidates, carrier)

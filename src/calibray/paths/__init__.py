@@ -1,4 +1,4 @@
-"""Paths: the path program, and the chains of interactions from which any tracer's paths are compiled."""
+"""Paths: the path program, and its compilation from the chains of interactions of any ray tracer."""
 
 from calibray.paths.file_format import FORMAT_VERSION as FORMAT_VERSION
 from calibray.paths.file_format import seal as seal

@@ -1,10 +1,10 @@
-"""Geometry of traced paths: from vertices and normals to the constants of the path program.
+"""Geometry of traced paths: computation of the constants of the path program from vertices and normals.
 
-The field of a path is a Jones vector. Each interaction has its own frame for this vector: the first axis is s = k x n /
-|k x n| (transverse electric), and the second is k x s. Sionna RT expresses the field between interactions in the basis
-(theta, phi) of the direction of travel; here the two rotations, out of one frame and into the next, are combined.
-Sionna's conventions apply (reference near the poles, orientation of normals and wedges, mirrored instead of traced
-direction after a reflection), so that path gains also agree in phase.
+The field of a path is a Jones vector. Each interaction has a frame for this vector. The first axis is s = k x n / |k x
+n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT expresses the field in the basis
+(theta, phi) of the direction of travel. This module combines the two rotations, out of one frame and into the next. The
+conventions are those of Sionna RT (reference near the poles, orientation of normals and wedges, mirrored instead of
+traced direction after a reflection), so that path gains also agree in phase.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from calibray.paths.interactions import Diffraction, Diffuse, Kind
 
 @dataclass(frozen=True)
 class Chains:
-    """Paths as found by a tracer, padded to the largest depth D.
+    """Paths found by a ray tracer, padded to the largest depth D.
 
     Attributes:
         source: Start of every path [P, 3], [m].
         target: End of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        normal: Normals of the hit surfaces, pointing to either side [P, D, 3].
-        kind: Kinds of interaction, 0 after the last interaction [P, D].
-        material: Material of every interaction [P, D].
+        normal: Normals of the surfaces at the interactions, pointing to either side [P, D, 3].
+        kind: Kinds of interaction [P, D]; 0 after the last interaction.
+        material: Index of the material of every interaction [P, D].
         probability: Probability with which the tracer chose the kind of interaction [P, D].
         samples: Number of rays launched per source.
         edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
@@ -52,20 +52,21 @@ class Chains:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The geometric part of a path program; names and shapes as in `calibray.paths.Paths`.
+    """The geometric part of a path program, with the names and shapes of `calibray.paths.Paths`.
 
     Attributes:
         delay: Propagation delay [P], [s].
         spreading: Amplitude spreading [P], [1/m].
         departure_direction: Unit vector of departure [P, 3].
         arrival_direction: Unit vector of travel at the target [P, 3].
-        departure_rotation: (cos, sin) from the basis (theta, phi) of departure into the first frame [P, 2].
-        arrival_rotation: (cos, sin) from the last frame into the basis (theta, phi) of arrival [P, 2].
-        first: Index of each path's first interaction [P + 1].
+        departure_rotation: (cos, sin) of the rotation from the basis (theta, phi) of departure into the first frame [P,
+            2].
+        arrival_rotation: (cos, sin) of the rotation from the last frame into the basis (theta, phi) of arrival [P, 2].
+        first: Index of the first interaction of each path [P + 1].
         kind: Kind of every interaction [I].
         material: Index of its material [I].
         cos_incidence: Cosine of the angle of incidence [I].
-        rotation: (cos, sin) of the rotation from the previous frame into the interaction's own [I, 2].
+        rotation: (cos, sin) of the rotation from the previous frame into the frame of the interaction [I, 2].
         diffuse: Table of diffuse interactions.
         diffraction: Table of diffractions.
     """
@@ -189,7 +190,7 @@ def compile_chains(chains: Chains) -> Geometry:
 def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True) -> NDArray[np.float64]:
     """Basis vector theta [..., 3] for directions of travel [..., 3], the first axis of the basis (theta, phi).
 
-    Near the poles, `pole_reference` uses Sionna's fixed reference -x instead of the limit of theta.
+    Near the poles, `pole_reference` selects the fixed reference -x of Sionna RT instead of the limit of theta.
     """
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
@@ -209,10 +210,10 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
 
 
 def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """First axis [..., 3] of the frame of incidence: k x n, normalized (ITU-R P.2040 section 2.2.2).
+    """First axis [..., 3] of the frame of incidence: the normalized k x n (ITU-R P.2040 section 2.2.2).
 
-    At normal incidence any transverse vector may be used, because the transverse electric and magnetic coefficients
-    then describe the same reflection.
+    At normal incidence, any transverse vector can be used, because the transverse electric and magnetic coefficients
+    describe the same reflection.
     """
     cross = _cross(direction, normal)
     degenerate = _dot(cross, cross) < 1e-12
@@ -224,7 +225,7 @@ def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float
 def rotate(
     direction: NDArray[np.float64], current: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(cos, sin) [..., 2] of the rotation of a Jones vector's frame about its direction of travel.
+    """(cos, sin) [..., 2] of the rotation of the frame of a Jones vector about the direction of travel.
 
     The vector (a, b) becomes (cos a + sin b, -sin a + cos b). `current` and `target` are the first axes of both frames
     [..., 3].
@@ -263,7 +264,7 @@ def _wedge(
     edge: NDArray[np.float64],
     distance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], ...]:
-    """Constants of a wedge diffraction, with Sionna RT's conventions.
+    """Constants of a wedge diffraction, in the conventions of Sionna RT.
 
     With distances s and s' to the edge, `distance` is s s' / (s + s').
     The results are the columns of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
@@ -297,7 +298,7 @@ def _wedge(
 def _azimuth(
     away: NDArray[np.float64], tangent: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Azimuth in [0, 2 pi) of a direction that points away from the edge, measured from the 0-face."""
+    """Azimuth in [0, 2 pi), measured from the 0-face, of a direction that points away from the edge."""
     # arccos alone gives the angle in front of the plane of the 0-face; behind it, the azimuth is 2 pi minus that.
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
@@ -312,7 +313,7 @@ def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 def _in_path_order(
     parts: list[tuple[NDArray[Any], ...]], empty: Diffuse | Diffraction
 ) -> list[NDArray[np.float64]]:
-    """Sort the columns of a table collected step by step into the order of the interactions."""
+    """Sort the columns of a table, which were collected step by step, into the order of the interactions."""
     if not parts:
         return list(vars(empty).values())
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))

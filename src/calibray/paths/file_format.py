@@ -1,13 +1,13 @@
-"""Content and seal of a path file: every dataset has a shape, type and range, which are checked on reading.
+"""Content and seal of a path file. The shape, type and range of every dataset are checked when a file is read.
 
-`docs/reference/path-file.md` explains the datasets.
+The datasets are described in `docs/reference/path-file.md`.
 
 The seal is a checksum at the start of the file, which is verified before anything else is read. HDF5 allows a user
-block in front of the file's content. The block contains the SHA-256 of the content in one line of text. A damaged file
-can hang or crash the HDF5 library (of 3,000 files with flipped bits, one hung and one crashed it), so the library reads
-a file only if the checksum matches. A file from another source may have been changed and sealed again (reading 5 of
-3,000 such files took more than a minute), so it is first read in a process with limits. A file that this user's
-Calibray wrote or validated earlier is recognised by its checksum and read directly.
+block in front of the content. This block contains the SHA-256 digest of the content as one line of text. A damaged file
+can hang or crash the HDF5 library (one hang and one crash for 3,000 files with flipped bits), so the library reads a
+file only if the checksum matches. A file from a different source may have been changed and sealed again (reading 5 of
+3,000 such files took more than a minute). Such a file is first read in a process with limits. A file that Calibray
+wrote or validated earlier for the same user is recognized by its checksum and read directly.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ FORMAT: Final = "calibray/paths"
 FORMAT_VERSION: Final = 1
 
 _SETTING: Final = "setting_"
-"""Prefix of the attributes that record how the paths were traced."""
+"""Prefix of the attributes that record the settings of the trace."""
 
 _ROUNDING: Final = 1e-3
-"""Tolerance of the ranges, because numbers may have been rounded to single precision."""
+"""Tolerance of the ranges, because numbers can have been rounded to single precision."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Dataset:
     """One dataset of a path file.
 
     Attributes:
-        shape: Sizes of its dimensions: numbers, or the letters used in `docs/reference/path-file.md`.
+        shape: Sizes of the dimensions: numbers, or the letters used in `docs/reference/path-file.md`.
         kind: "f" for floating-point numbers, "i" for integers, "O" for text.
         lower: Smallest value.
         upper: Largest value.
@@ -126,7 +126,7 @@ OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
 
 
 def write(file: h5py.File, content: Content) -> None:
-    """Write the content of a path file: every dataset of `DATASETS`, and the datasets of `OPTIONAL` that it has."""
+    """Write the content of a path file: every dataset of `DATASETS`, and those of `OPTIONAL` that are present."""
     file.attrs.update({"format": FORMAT, "version": FORMAT_VERSION, "frequency_hz": content.frequency})
     file.attrs.update({f"{_SETTING}{key}": value for key, value in content.settings.items()})
     for name, dataset in (DATASETS | OPTIONAL).items():
@@ -137,11 +137,11 @@ def write(file: h5py.File, content: Content) -> None:
 
 
 def read(file: h5py.File) -> Content:
-    """Read a path file and check its whole content.
+    """Read a path file and check its entire content.
 
     Raises:
-        InputError: The format or version differs, or a dataset is missing, has a wrong shape or type, or is out of
-            range; the message omits the file's name.
+        InputError: The format or version differs, or a dataset is missing, has the wrong shape or type, or is out of
+            range. The message does not contain the file name.
     """
     if (name := file.attrs.get("format")) != FORMAT:
         raise InputError(f"is not a Calibray path file (attribute format = {name!r}, must be {FORMAT!r})")
@@ -150,7 +150,7 @@ def read(file: h5py.File) -> Content:
     frequency = _attribute(file, "frequency_hz")
     lower, upper = FREQUENCIES
     if isinstance(frequency, str | bool | np.bool_) or not lower <= float(frequency) <= upper:
-        fault = _damaged(f"frequency_hz = {frequency!r}, must lie in {lower:g} to {upper:g} Hz")
+        fault = _damaged(f"frequency_hz = {frequency!r}, must be between {lower:g} and {upper:g} Hz")
         raise fault
     present = {name: dataset for name, dataset in OPTIONAL.items() if name in file}
     arrays = {name: _array(file, name, dataset) for name, dataset in (DATASETS | present).items()}
@@ -181,7 +181,7 @@ def _settings(file: h5py.File) -> Iterator[tuple[str, object]]:
 
 
 def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
-    """Read one dataset. It must be stored contiguously in this file and must not exceed the file's size."""
+    """Read one dataset, which must be stored contiguously in this file and must not exceed the file size."""
     item, length = file.get(name), file.id.get_filesize()
     link = file.get(name, getlink=True)
     if not isinstance(item, h5py.Dataset) or not isinstance(link, h5py.HardLink):
@@ -241,15 +241,15 @@ def _check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
             continue
         # NaN fails the comparisons, but infinity may pass them.
         if not ((values >= dataset.lower) & (values <= dataset.upper)).all() or not np.isfinite(values).all():
-            raise _damaged(f"dataset {name} has a number that is not finite or out of range")
+            raise _damaged(f"dataset {name} contains a number that is not finite or is out of range")
     for name in ("interactions/rotation", "diffuse/rotation", "diffraction/rotations"):
         if (abs((arrays[name] ** 2).sum(axis=-1) - 1) > 10 * _ROUNDING).any():
-            raise _damaged(f"dataset {name} has a pair that is not a cosine and sine")
+            raise _damaged(f"dataset {name} contains a pair that is not a cosine and sine")
     if not np.isin(arrays["interactions/kind"], list(Kind)).all():
-        raise _damaged("interactions/kind has an unknown kind")
+        raise _damaged("interactions/kind contains an unknown kind")
     names = arrays["materials/name"].tolist()
     if len(set(names)) != len(names) or "" in names:
-        raise _damaged("a material has no name, or two have the same name")
+        raise _damaged("a material has no name, or two materials have the same name")
 
 
 def _check_indices(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -262,7 +262,7 @@ def _check_indices(arrays: Mapping[str, NDArray[Any]]) -> None:
     for name, target in indexed.items():
         index, count = arrays[name], len(arrays[target])
         if not ((index >= 0) & (index < count)).all():
-            raise _damaged(f"dataset {name} has an index outside 0 to {count - 1}")
+            raise _damaged(f"dataset {name} contains an index outside 0 to {count - 1}")
 
 
 BLOCK: Final = 512
@@ -273,7 +273,7 @@ _CHUNK: Final = 2**20
 
 
 def seal(path: str | Path) -> None:
-    """Write or renew the checksum of a path file that another program has written or changed.
+    """Write or update the checksum of a path file that another program has written or changed.
 
     `Paths.save` already seals the files that it writes.
 
@@ -297,12 +297,12 @@ def seal(path: str | Path) -> None:
                     sealed.write(chunk)
     except OSError as error:
         raise InputError(
-            f"{target}: cannot be sealed ({error.strerror}); give a path file that can be written"
+            f"{target}: cannot be sealed ({error.strerror}); give a writable path file"
         ) from None
 
 
 def write_checksum(partial: Path) -> str:
-    """Write the checksum into the empty user block of an HDF5 file, and return it in hexadecimal."""
+    """Write the checksum into the empty user block of an HDF5 file, and return the checksum in hexadecimal."""
     with partial.open("r+b") as file:
         file.seek(BLOCK)
         block = _block(file)
@@ -312,10 +312,11 @@ def write_checksum(partial: Path) -> str:
 
 
 def verify(path: Path) -> str:
-    """Raise an error if the content does not match the seal; return the checksum in hexadecimal.
+    """Check that the content matches the seal, and return the checksum in hexadecimal.
 
     Raises:
-        InputError: The file is not a sealed HDF5 file, or has changed since it was sealed; the message omits its name.
+        InputError: The file is not a sealed HDF5 file, or was changed after sealing. The message does not contain the
+            file name.
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
@@ -327,7 +328,7 @@ def verify(path: Path) -> str:
         if not head.startswith(PATH_SEAL):
             raise InputError("is damaged or not a path file; trace again")
         if _block(file) != head:
-            raise InputError("is damaged (its checksum does not match); trace again")
+            raise InputError("is damaged (the checksum does not match); trace again")
     return _digest(head)
 
 
@@ -336,7 +337,7 @@ def _digest(block: bytes) -> str:
 
 
 def _block(file: BinaryIO) -> bytes:
-    """The user block for the content that starts at the file's current position."""
+    """The user block for the content that starts at the current position in the file."""
     start, digest = file.tell(), hashlib.sha256()
     while chunk := file.read(_CHUNK):
         digest.update(chunk)
@@ -345,7 +346,7 @@ def _block(file: BinaryIO) -> bytes:
 
 
 KNOWN_BYTES: Final = 2**20
-"""Size limit of the entries of known files [bytes]; each takes 32 bytes."""
+"""Size limit of the entries of known files [bytes]. Each entry takes 32 bytes."""
 
 _CODE: Final = """
 from calibray.errors import InputError
@@ -357,11 +358,11 @@ except InputError as error:
 """
 
 _known_here: Final[set[str]] = set()
-"""Checksums of files that this process has already accepted, with or without a cache folder."""
+"""Checksums of files that this process has accepted, with or without a cache folder."""
 
 
 def remember(digest: str) -> None:
-    """Record that this user's Calibray wrote or validated the file with this checksum."""
+    """Record that Calibray has written or validated the file with this checksum for this user."""
     _known_here.add(digest)
     store = _known_files()
     if store is not None and store.trusted:
@@ -372,7 +373,7 @@ def validate(file: Path, digest: str) -> None:
     """Read a path file with a matching checksum in a separate process, unless the checksum is known.
 
     Raises:
-        InputError: The file is damaged, or the reading does not finish; the message omits its name.
+        InputError: The file is damaged, or reading does not finish. The message does not contain the file name.
     """
     store = _known_files()
     if digest in _known_here or (store is not None and store.trusted and store.get(digest) is not None):
@@ -382,10 +383,10 @@ def validate(file: Path, digest: str) -> None:
         is_read = run_limited(_CODE.format(file=str(file.resolve())), 4 * 2**30 + 8 * size, size)
     except TimeoutError as error:
         raise InputError(
-            f"is damaged (the HDF5 library does not finish reading it {error}); trace again"
+            f"is damaged (the HDF5 library does not finish reading the file {error}); trace again"
         ) from None
     if not is_read:
-        raise InputError("is damaged (the HDF5 library fails while reading it); trace again")
+        raise InputError("is damaged (the HDF5 library fails while reading the file); trace again")
     remember(digest)
 
 

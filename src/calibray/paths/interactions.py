@@ -1,4 +1,4 @@
-"""Kinds of interaction, and tables of the constants that only diffuse reflections and diffractions have."""
+"""Kinds of interaction, and tables of additional constants of diffuse reflections and diffractions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Kind(IntEnum):
-    """Kinds of interaction, with Sionna's codes."""
+    """Kinds of interaction, with the codes of Sionna RT."""
 
     SPECULAR = 1
     DIFFUSE = 2
@@ -20,14 +20,14 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Diffuse:
-    """Further constants of the diffuse interactions, one row each, in their order.
+    """Additional constants of the diffuse interactions, one row per interaction, in the same order.
 
     Attributes:
         rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
             of the incident direction, in which the XPD matrix acts [D, 2].
-        solid_angle: Solid angle of the ray tube, divided by its sampling probability when traced [D], [sr].
+        solid_angle: Solid angle of the ray tube, divided by the sampling probability in the trace [D], [sr].
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
-        cos_specular: Cosine of the angle between the scattered and the specular direction [D].
+        cos_specular: Cosine of the angle between the scattered and specular directions [D].
         cos_backward: Cosine of the angle between the scattered direction and the direction back to the source [D].
     """
 
@@ -45,7 +45,7 @@ class Diffuse:
 
 @dataclass(frozen=True)
 class Diffraction:
-    """Further constants of the diffractions, one row each, in their order.
+    """Additional constants of the diffractions, one row per diffraction, in the same order.
 
     The cosine of incidence on the 0-face is in `Paths.cos_incidence`.
 

@@ -1,9 +1,9 @@
-"""The path program: traced paths in a form in which fields can be evaluated for any materials.
+"""The path program: traced paths in a form that allows fields to be evaluated for any materials.
 
-A path is a transmit field, a chain of interactions, and a receive field. An interaction stores everything that
-determines how its material acts: the material, the cosine of the angle of incidence, the kind, and the real rotation
-from the frame of the previous interaction into its own (first axis k x n, transverse electric). The first rotation is
-part of the transmit field, and the last rotation is part of the receive field.
+A path is a transmit field, a chain of interactions, and a receive field. An interaction contains the material, the
+cosine of the angle of incidence, the kind, and the real rotation from the frame of the previous interaction into the
+frame of this interaction (first axis k x n, transverse electric). The first rotation is part of the transmit field, and
+the last rotation is part of the receive field.
 """
 
 from __future__ import annotations
@@ -34,32 +34,33 @@ _WIDTH: Final = 80
 class Paths:
     """A traced campaign as a path program.
 
-    P paths, I interactions, L links, R receive and T transmit ports (2 for dual polarization, otherwise 1).
+    There are P paths, I interactions, L links, R receive and T transmit ports (2 for dual polarization, otherwise 1).
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        materials: The materials by name, as in the trace; `material` indexes them in this order.
+        materials: The materials of the trace by name; `material` contains indices in this order.
         tx_position: Transmitter of every link [L, 3], [m].
         rx_position: Receiver of every link [L, 3], [m].
         link: Link of every path [P], non-decreasing.
         delay: Propagation delay [P], [s].
         spreading: Amplitude spreading [P], [1/m]: 1/r, or 1/sqrt(s s' (s + s')) with a diffraction.
         departure: Zenith and azimuth of departure [P, 2], [rad].
-        arrival: Zenith and azimuth of arrival, from the receiver towards the source [P, 2], [rad].
+        arrival: Zenith and azimuth of arrival, pointing from the receiver towards the source [P, 2], [rad].
         tx_field: Transmit pattern in the frame of the first interaction [P, T, 2], complex.
         rx_field: Receive pattern in the frame after the last interaction [P, R, 2], complex.
-        first: Index of each path's first interaction [P + 1]; path p has interactions first[p] .. first[p + 1] - 1.
+        first: Index of the first interaction of each path [P + 1]; path p has the interactions first[p] to first[p + 1]
+            - 1.
         kind: `Kind` of every interaction [I].
         material: Index of the material of every interaction [I].
         cos_incidence: Cosine of the angle of incidence [I].
-        rotation: (cos, sin) of the rotation from the previous frame into the interaction's own [I, 2].
+        rotation: (cos, sin) of the rotation from the previous frame into the frame of the interaction [I, 2].
         vertex: Points of interaction [I, 3], [m], for plots; in single precision, or in double precision far from the
-            origin. The fields do not depend on them.
-        diffuse: Further constants of the diffuse interactions.
+            origin. The fields do not depend on these points.
+        diffuse: Additional constants of the diffuse interactions.
         diffraction: Further constants of the diffractions.
-        settings: How the paths were traced, for documentation.
-        correction: Ratio of the path's power in the engine that found it to its replayed power with the same constants
-            [P]; the power of the path is multiplied by this ratio. None if the replay needs no correction.
+        settings: Settings of the trace, for documentation.
+        correction: Ratio of the power of each path in the engine that found it to its replayed power with the same
+            constants [P]. The replayed power is multiplied by this ratio. None without a correction.
     """
 
     frequency: float
@@ -119,11 +120,11 @@ class Paths:
         """The same paths at another carrier frequency; the traced geometry is unchanged.
 
         With diffuse reflection and refraction, the share of sampled paths depends on the constants at the traced
-        carrier; the estimate stays unbiased at other carriers.
+        carrier. The estimate remains unbiased at other carriers.
 
         Args:
             frequency: Carrier frequency [Hz].
-            materials: Constants at that carrier, by name; materials that are not named keep theirs.
+            materials: Constants at this carrier, by name. Materials that are not named keep their constants.
 
         Returns:
             The program at that carrier.
@@ -134,45 +135,45 @@ class Paths:
         return replace(self, frequency=check_frequency(frequency), materials=self._with_materials(materials))
 
     def material_table(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
-        """Constants of the materials as a matrix [M, 8]; materials that are not named keep the constants of the trace.
+        """Constants of the materials as a matrix [M, 8]. Materials that are not named keep the constants of the trace.
 
-        Rows are in the order of `Paths.materials`, columns in that of `calibray.materials.FIELDS`.
+        Rows are in the order of `Paths.materials`, and columns in the order of `calibray.materials.FIELDS`.
 
         Raises:
-            InputError: A name is not a material of the paths, or a scattering pattern differs from the trace's.
+            InputError: A name is not a material of the paths, or a scattering pattern differs from that of the trace.
         """
         combined = self._with_materials(materials)
         for name, material in combined.items():
             traced = self.materials[name].scattering_pattern
             if material.scattering_pattern != traced:
                 raise InputError(
-                    f"material {name!r}: scattering_pattern {material.scattering_pattern!r} differs from the traced "
-                    f"{traced!r}; trace again with it in [materials]"
+                    f"material {name!r}: scattering_pattern {material.scattering_pattern!r} differs from {traced!r} in "
+                    "the trace; state it in [materials] and trace again"
                 )
         return constants_matrix(combined)
 
     def _with_materials(self, materials: Mapping[str, Material] | None) -> dict[str, Material]:
         if unknown := sorted(set(materials or {}) - set(self.materials)):
             raise InputError(
-                f"no material {unknown[0]!r} in the traced scene; it has {', '.join(self.materials)}"
+                f"no material {unknown[0]!r} in the traced scene, which has {', '.join(self.materials)}"
             )
         for name, material in (materials or {}).items():
             if not isinstance(material, Material):
                 raise InputError(
-                    f"material {name!r}: is {material!r}, must be a Material with all its constants; for instance "
+                    f"material {name!r}: is {material!r}, must be a Material with all constants; for instance "
                     f"dataclasses.replace(paths.materials[{name!r}], relative_permittivity=5.0)"
                 )
         return {**self.materials, **(materials or {})}
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
-        """Write an HDF5 file (format in docs/reference/path-file.md), readable by h5py and MATLAB.
+        """Write an HDF5 file (format in docs/reference/path-file.md) that h5py and MATLAB can read.
 
         Args:
-            path: File to write; an existing path file is replaced only once the new one is complete.
-            overwrite: Replace a file that Calibray did not write.
+            path: File to write. An existing path file is replaced after the new file is complete.
+            overwrite: Whether to replace a file that Calibray did not write.
 
         Raises:
-            InputError: The folder does not exist or cannot be written, or the file there must not be replaced.
+            InputError: The folder does not exist or cannot be written, or an existing file must not be replaced.
         """
         target = check_file(path, overwrite=overwrite)
         try:
@@ -194,14 +195,16 @@ class Paths:
             path: The HDF5 file.
 
         Returns:
-            The path program, equal to the saved one.
+            The path program, equal to the saved program.
 
         Raises:
             InputError: The file does not exist, is not a path file, has a different version, or is damaged.
         """
         source = as_path(path, "path file")
         if not exists(source):
-            raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
+            raise InputError(
+                f"{source}: does not exist; create this file with `calibray trace STUDY -o {source}`"
+            )
         try:
             file_format.validate(source, file_format.verify(source))
             return read_paths(source)
@@ -215,7 +218,8 @@ def read_paths(file: str | Path) -> Paths:
     """Read the path program from an HDF5 file without verifying its checksum.
 
     Raises:
-        InputError: It is not a path file, has a different version, or is damaged; the message omits its name.
+        InputError: The file is not a path file, has a different version, or is damaged. The message does not contain
+            the file name.
     """
     try:
         with h5py.File(file, "r") as stream:
@@ -238,7 +242,7 @@ def _numbers(index: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def take(paths: Paths, index: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
-    """Select paths [n] by index, in the given order, or by a mask; the links are unchanged."""
+    """Select paths [n] by index, in the given order, or by a mask. The links are unchanged."""
     index = _numbers(index)
     depth = np.diff(paths.first)[index]
     first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
@@ -256,7 +260,7 @@ def take(paths: Paths, index: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
 
 
 def take_links(paths: Paths, links: NDArray[np.int64] | NDArray[np.bool_]) -> Paths:
-    """Select links [n] by index, in the given order, or by a mask; a link may be selected more than once."""
+    """Select links [n] by index, in the given order, or by a mask. A link can be selected more than once."""
     links = _numbers(links)
     start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
     count = np.diff(start)[links]
@@ -272,7 +276,7 @@ def take_links(paths: Paths, links: NDArray[np.int64] | NDArray[np.bool_]) -> Pa
 
 
 def concatenate(parts: Sequence[Paths]) -> Paths:
-    """Join path programs of the same links, and sort their paths by link; within a link, the order is that of `parts`.
+    """Join path programs of the same links and sort the paths by link. Within a link, the order is that of `parts`.
 
     All parts have the same frequency, materials and links.
     """
@@ -293,9 +297,10 @@ def concatenate(parts: Sequence[Paths]) -> Paths:
 
 
 def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
-    """Join path programs of different links, each with the indices of its links in the joined program.
+    """Join path programs of different links. Each part has the indices of its links in the joined program.
 
-    Together they contain every link once. All have the same frequency and materials; the first part gives the settings.
+    Together, the parts contain every link once. All parts have the same frequency and materials. The settings are those
+    of the first part.
     """
     num_links = sum(len(links) for links, _ in parts)
     tx, rx = np.empty((num_links, 3)), np.empty((num_links, 3))
@@ -310,14 +315,14 @@ def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
 
 
 def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int64]) -> Table:
-    """The table's rows for the given interactions; `has_row` marks all interactions of the table's kind [I]."""
+    """The rows of a table for the given interactions; `has_row` marks all interactions of the kind of the table [I]."""
     # An interaction's row is the number of interactions of its kind before it.
     row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
     return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
 
 
 def _joined_corrections(parts: Sequence[Paths]) -> NDArray[np.float64] | None:
-    """Corrections of all paths; None if no part has any."""
+    """Corrections of all paths; None if no part has corrections."""
     if all(part.correction is None for part in parts):
         return None
     return np.concatenate(
@@ -333,7 +338,7 @@ def _joined(tables: Sequence[Table]) -> Table:
 
 
 def _content(paths: Paths) -> file_format.Content:
-    """The program as the content of a path file."""
+    """The path program as the content of a path file."""
     materials = paths.materials.values()
     arrays: dict[str, Any] = {
         "materials/name": list(paths.materials),
@@ -358,7 +363,7 @@ def _content(paths: Paths) -> file_format.Content:
 
 
 def _paths(content: file_format.Content) -> Paths:
-    """The program from the content of a path file."""
+    """The path program from the content of a path file."""
     groups: dict[str, dict[str, NDArray[Any]]] = {}
     for name, values in content.arrays.items():
         group, _, attribute = name.partition("/")
@@ -388,7 +393,7 @@ def _paths(content: file_format.Content) -> Paths:
 
 
 def _summary(paths: Paths) -> dict[str, str]:
-    """Summary of the paths for a terminal or a notebook: text by heading."""
+    """Summary of the paths for a terminal or notebook, as texts by heading."""
     num_unreached = len(paths.links_without_path)
     counts = np.bincount(paths.kind, minlength=max(Kind) + 1)
     kinds = [f"{counts[kind]:,} {kind.name.lower()}" for kind in Kind if counts[kind]]

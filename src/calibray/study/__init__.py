@@ -1,4 +1,4 @@
-"""The study file: one calibration problem in TOML, read into a closed, validated model, and opened once."""
+"""Studies: the study file, which defines one calibration problem in TOML, and the opened study."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The sections of a study file that state what is calibrated and how. They are closed: unknown keys are errors."""
+"""The sections of a study file that define the calibration. The sections are closed: unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from calibray.support.strict_models import Section, Text
 
 
 class ObjectiveSection(Section):
-    """``[objective]``: how paths are combined into a path loss, and how links without a path are treated.
+    """``[objective]``: combination of paths into a path loss, and treatment of links without a path.
 
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
             over the bandwidth).
-        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it with `ceiling_db`.
+        no_path: "exclude" omits links without a path from the objective; "censor" assigns `ceiling_db` to them.
         ceiling_db: Largest measurable path loss [dB]; only with "censor".
     """
 
@@ -34,26 +34,27 @@ class ObjectiveSection(Section):
     @model_validator(mode="after")
     def _ceiling_only_with_censor(self) -> Self:
         if self.no_path == "censor" and self.ceiling_db is None:
-            raise InputError(
-                "no_path = 'censor' needs ceiling_db [dB], the largest loss that could be measured"
-            )
+            raise InputError("no_path = 'censor' needs ceiling_db [dB], the largest measurable path loss")
         if self.no_path == "exclude" and self.ceiling_db is not None:
             raise InputError(
-                f"ceiling_db = {self.ceiling_db:g} has no effect; set no_path = 'censor' or remove it"
+                f"ceiling_db = {self.ceiling_db:g} has no effect; set no_path = 'censor' or remove ceiling_db"
             )
         return self
 
 
 class PriorSection(Section):
-    """The prior of a parameter: log-normal around a value, or Gaussian around the start value.
+    """The prior of a parameter: log-normal around a value or another parameter, or Gaussian around the start value.
 
     Attributes:
-        itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
-        value: The value itself, in the field's unit, in place of `itu`.
-        like: Another parameter on which the prior is centred, in place of `itu`: both belong to one population.
-        spread: Standard deviation of the natural logarithm: 0.3 is about 30 %.
-        std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of all others.
-        shared: Whether `std` is the spread of a population of transmitters; it is estimated if their spread is "auto".
+        itu: Name of the ITU-R P.2040 material on which the prior is centred, with or without "@REVISION".
+        value: Value on which the prior is centred, in the unit of the parameter, instead of `itu`.
+        like: Name of another parameter on which the prior is centred, instead of `itu`. Both parameters belong to one
+            population.
+        spread: Standard deviation of the natural logarithm; 0.3 corresponds to about 30 %.
+        std: Standard deviation of a Gaussian prior around the start value, in the unit of the parameter. This key
+            replaces `itu`, `value`, `like` and `spread`.
+        shared: Whether `std` is the spread of a population of transmitters. This spread is estimated if the spread of
+            the population is "auto".
     """
 
     itu: Text | None = None
@@ -72,7 +73,7 @@ class PriorSection(Section):
                 )
             return self
         if self.spread is None:
-            raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
+            raise InputError("a prior needs either spread, the standard deviation of the logarithm, or std")
         if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
             raise InputError(
                 "a prior is centred on an ITU material, a value or another parameter: give exactly one of itu, value "
@@ -82,16 +83,17 @@ class PriorSection(Section):
 
 
 class ParameterSection(Section):
-    """``[parameters]``, one entry: the bounds, start and scale of one parameter.
+    """One entry of ``[parameters]``: bounds, start value and scale of a parameter.
 
     Attributes:
-        bounds: Lower and upper bound, in the field's unit.
-        start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's value.
+        bounds: Lower and upper bounds, in the unit of the parameter.
+        start: Value before calibration: a number, "itu:NAME" or "itu:NAME@REVISION". If absent, the value in the scene
+            is used.
         scale: "linear" or "log".
-        prior: Its prior; uniform within the bounds if absent.
-        spread: Standard deviation, in the field's unit, of individual transmitters' values around the common value of a
-            parameter such as "tx:*.azimuth", or "auto" to estimate it. If absent, only the common value is
-            calibrated.
+        prior: Prior of the parameter; uniform within the bounds if absent.
+        spread: Standard deviation of the values of individual transmitters around the common value of a parameter such
+            as "tx:*.azimuth", in the unit of the parameter, or "auto" to estimate it. If absent, only the common value
+            is calibrated.
     """
 
     bounds: tuple[float, float]
@@ -101,11 +103,11 @@ class ParameterSection(Section):
     spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The centre of the prior at a carrier [Hz], in the field's unit; 1 if it is centred on another parameter.
+        """The centre of the prior at a carrier [Hz], in the parameter's unit; 1 if another parameter is the centre.
 
         Raises:
-            InputError: There is no prior, ITU-R P.2040 does not give this constant, or the lower bound or the value is
-                not positive.
+            InputError: There is no prior, ITU-R P.2040 does not specify this constant, or the lower bound or the value
+                is not positive.
         """
         if self.prior is None:
             raise InputError(f"{name}: has no prior")
@@ -114,8 +116,8 @@ class ParameterSection(Section):
             value = itu_start(name, f"itu:{self.prior.itu}", frequency)
         if not min(value, self.bounds[0]) > 0:
             raise InputError(
-                f"{name}: a log-normal prior needs a positive value and lower bound, but they are {value:g} and "
-                f"{self.bounds[0]:g}"
+                f"{name}: a log-normal prior needs a positive value and a positive lower bound, but these are "
+                f"{value:g} and {self.bounds[0]:g}"
             )
         return value
 
@@ -128,16 +130,16 @@ def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class NuisanceTerm:
-    """A column of the links times an unknown coefficient, one for all links or one per group.
+    """A column of the links times an unknown coefficient, either common to all links or per group.
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Columns whose joined labels define the groups; without columns, one coefficient for all links.
-        bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; a flat prior if None; "auto" for a
-            prior around the mean of the groups with an estimated standard deviation.
+        per: Columns whose joined labels define the groups. If empty, there is one coefficient for all links.
+        bounds: Lower and upper bounds of the coefficient, in dB per unit of the column; unbounded if None.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit. The prior is flat if None. With
+            "auto", the prior is centred on the mean of the groups and its standard deviation is estimated.
     """
 
     by: str
@@ -147,11 +149,11 @@ class NuisanceTerm:
 
 
 class OffsetSection(Section):
-    """``[offset]``: the nuisance term "offset", one [dB] for all links or one per group.
+    """``[offset]``: the nuisance term "offset" [dB], one value for all links or one per group.
 
     Attributes:
-        per: Column of group labels, or several columns whose labels are joined; one offset for all links if absent.
-        bounds: Lower and upper bound [dB]; unbounded if absent.
+        per: Column of group labels, or several columns whose labels are joined. If absent, all links have one offset.
+        bounds: Lower and upper bounds [dB]; unbounded if absent.
         prior_db: Standard deviation of a Gaussian prior around zero [dB]; a flat prior if absent.
     """
 
@@ -162,37 +164,38 @@ class OffsetSection(Section):
     _ordered = field_validator("bounds")(_ordered)
 
     def term(self) -> NuisanceTerm:
-        """The nuisance term that this section abbreviates."""
+        """The nuisance term that this section defines."""
         per = (self.per,) if isinstance(self.per, str) else self.per or ()
         return NuisanceTerm("constant", per, self.bounds, self.prior_db)
 
 
 OFFSET: Final = "offset"
-"""Name of the term of ``[offset]``."""
+"""Name of the nuisance term that ``[offset]`` defines."""
 
 FREE_OFFSET: Final = "free offset"
-"""Name of the term that tests for an undeclared offset."""
+"""Name of the nuisance term that tests for an undeclared offset."""
 
 TX_OFFSET: Final = "offset of the transmitter"
-"""Name of the term that gives each transmitter an offset in predictions."""
+"""Name of the nuisance term with one offset per transmitter, used in predictions."""
 
 OF_ALL_LINKS: Final = " of all links"
-"""Ending of the names of further terms in predictions."""
+"""Suffix of the names of nuisance terms that are added for predictions and have one coefficient for all links."""
 
 
 class NuisanceSection(Section):
-    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, one for all links or one per group.
+    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, either common or per group.
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Column of group labels; one coefficient for all links if absent. "cluster" needs no column if `cluster_m`
-            is stated.
-        cluster_m: Side length of the squares whose receivers form the groups of "cluster" [m].
-        bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; a flat prior if absent. "auto" is a
-            prior around the mean of the groups with an estimated standard deviation (a random effect).
+        per: Column of group labels. If absent, there is one coefficient for all links. "cluster" needs no column if
+            `cluster_m` is stated.
+        cluster_m: Side length of the squares that group the receivers if `per` is "cluster" [m].
+        bounds: Lower and upper bounds of the coefficient, in dB per unit of the column; unbounded if absent.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; a flat prior if absent. With
+            "auto", the prior is centred on the mean of the groups and its standard deviation is estimated (a random
+            effect).
     """
 
     by: Text
@@ -206,9 +209,11 @@ class NuisanceSection(Section):
     @model_validator(mode="after")
     def _random_effect(self) -> Self:
         if self.prior == "auto" and (self.per is None or self.bounds is not None):
-            raise InputError("prior = 'auto' needs per, the column of the groups, and no bounds")
+            raise InputError(
+                "prior = 'auto' needs per, the column of the groups, and cannot be combined with bounds"
+            )
         if self.cluster_m is not None and self.per != CLUSTER:
-            raise InputError(f"cluster_m needs per = {CLUSTER!r}, squares of that side length")
+            raise InputError(f"cluster_m, the side length of squares, needs per = {CLUSTER!r}")
         return self
 
     def term(self) -> NuisanceTerm:
@@ -220,13 +225,14 @@ class NoiseSection(Section):
     """``[noise]``: the errors of measured links.
 
     Attributes:
-        std_db: Standard deviation of a link's error [dB], which sets the weight of the priors; estimated if absent.
+        std_db: Standard deviation of the error of a link [dB], which determines the weight of the priors. If absent, it
+            is estimated.
         kind: "gaussian", "student-t", or "auto" for intervals that account for both.
-        range_m: Correlation distance of neighbouring links' errors [m], 0 for none, or "auto".
-        heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
+        range_m: Correlation distance of the errors of neighbouring links [m]; 0 for no correlation, or "auto".
+        heterogeneity: Between-building spread of the constants of a material; 0 for no spread, or "auto".
         constants_spread: Standard deviation of the logarithm of those constants of calibrated materials (thickness,
-            conductivity, scattering coefficient) that are not parameters; 0 if the scene's values are exact. A
-            scattering coefficient of 0 has its own prior, unless this is 0.
+            conductivity, scattering coefficient) that are not parameters; 0 if the values in the scene are exact. A
+            scattering coefficient of 0 has a separate prior, unless `constants_spread` is 0.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
@@ -246,25 +252,25 @@ class NoiseSection(Section):
             stated.append(f"heterogeneity = {self.heterogeneity}")
         if len(stated) > 1:
             raise InputError(
-                f"noise: {' and '.join(stated)}: only one of them can be stated; leave the others at 'auto'"
+                f"noise: {' and '.join(stated)}: only one of these can be stated; leave the others at 'auto'"
             )
         return self
 
 
 DEFAULT_BLOCKS: Final = 4
-"""Number of spatial blocks, each held out in turn, in a drafted study and in a validation that states no number."""
+"""Default number of spatial blocks, each of which is held out in turn."""
 
 MOST_BLOCKS: Final = 100
-"""Largest number of spatial blocks: each needs a calibration."""
+"""Largest number of spatial blocks. Each block requires a calibration."""
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: links that are used for validation instead of calibration; chosen in one of three ways.
+    """``[holdout]``: links that are used for validation instead of calibration, selected in one of three ways.
 
     Attributes:
-        where: Row filter; links that satisfy it are held out.
+        where: Row filter that selects the held-out links.
         blocks: Number of spatial blocks, each held out in turn.
-        by: Column of labels; the links of each label are held out in turn.
+        by: Column of labels; the links with each label are held out in turn.
     """
 
     where: Text | None = None
@@ -279,11 +285,11 @@ class HoldoutSection(Section):
 
 
 class FidelitySection(Section):
-    """``[fidelity]``: a second trace with the calibrated materials, because paths may depend on them.
+    """``[fidelity]``: further traces with the calibrated materials, because the paths can depend on the materials.
 
     Attributes:
-        tolerance_db: Largest accepted change of a link's path loss [dB].
-        rounds: Largest number of traces, 0 for none; if absent, 3, or 4 if positions are parameters.
+        tolerance_db: Largest accepted change in the path loss of a link [dB].
+        rounds: Largest number of further traces. The default is 3, or 4 if positions are parameters.
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
@@ -312,10 +318,10 @@ class MethodSection(Section):
 
 
 LARGEST: Final = 10**6
-"""Largest integer value of a setting: no method can keep more candidates in memory."""
+"""Largest integer value of a setting. No method can store more candidates in memory."""
 
 LONGEST: Final = 10**4
-"""Largest number of entries in a list, and of characters in a string."""
+"""Largest number of entries in a list and of characters in a string."""
 
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),
@@ -326,12 +332,12 @@ _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:
-    """Raise an error for settings that a method does not have; the method itself checks their values.
+    """Check the names, types and sizes of a method's settings; the method itself checks the values.
 
-    If the method is unknown or chosen later, only the sizes of the values are checked.
+    If the method is unknown or is chosen later, only the sizes are checked.
 
     Raises:
-        InputError: A setting is unknown, of a wrong type, not finite or too large; the message begins with its key.
+        InputError: A setting is unknown, of the wrong type, not finite or too large. The message begins with its key.
     """
     if not options:
         return
@@ -355,7 +361,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
-    """Check a value against the annotation of the constructor's argument; types such as arrays are not checked."""
+    """Check the type of a value against the annotation of the argument; types such as arrays are not checked."""
     types = [part.strip() for part in str(argument.annotation).split("|")]
     if not set(types) - {"None"} <= set(_TYPES):
         return
@@ -382,7 +388,7 @@ def _check_size(prefix: str, value: Any, depth: int = 2) -> None:
             for entry in value:
                 _check_size(prefix, entry, depth - 1)
         case list() | tuple():
-            raise InputError(f"{prefix}: must be a list of at most {LONGEST:,} entries or such lists")
+            raise InputError(f"{prefix}: must be a list of at most {LONGEST:,} entries, nested at most once")
         case int() | float() | str():
             pass
         case _:

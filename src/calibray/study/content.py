@@ -26,7 +26,7 @@ from calibray.support.strict_models import Section, Text, dotted
 from calibray.tracing.antennas import EVERY, POSE, turns
 
 VERSION: Final = 1
-"""The version of the study file that this module reads."""
+"""Version of the study file that this module reads."""
 
 BUNDLED: Final = "sionna:"
 """Prefix of the name of a scene bundled with Sionna RT."""
@@ -67,7 +67,8 @@ class StudyContent(Section, ABC):
     def _known_version(cls, value: int) -> int:
         if value != VERSION:
             raise InputError(
-                f"this Calibray reads version {VERSION}; convert the file, or install a Calibray that reads it"
+                f"this version of Calibray reads version {VERSION} of the study file; convert the file, or install a "
+                "Calibray that reads it"
             )
         return value
 
@@ -82,17 +83,18 @@ class StudyContent(Section, ABC):
             raise InputError("objective.combining = 'band' needs scene.bandwidth [Hz]")
         if self.links.quantity == "rsrp" and self.offset is None:
             raise InputError(
-                "links.quantity = 'rsrp' needs [offset]: the transmitted power is unknown, and is part of the offset"
+                "links.quantity = 'rsrp' needs [offset]: the transmitted power is unknown and becomes part of the "
+                "offset"
             )
         if self.links.quantity == "rsrp" and self.objective.ceiling_db is not None:
             raise InputError(
-                "objective.no_path = 'censor' with links.quantity = 'rsrp': the transmitted power is unknown, and "
-                "therefore the largest path loss too; state the power (links.tx_power_dbm), or leave these links out"
+                "objective.no_path = 'censor' with links.quantity = 'rsrp': the largest path loss is unknown, because "
+                "the transmitted power is unknown; state the power (links.tx_power_dbm), or set no_path = 'exclude'"
             )
         if self.links.below_floor == "censor" and self.noise.range_m not in ("auto", 0):
             raise InputError(
-                f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are counted "
-                f"as if their errors were independent; remove one of them"
+                f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: the errors of censored "
+                "links are assumed to be independent; remove one of these keys"
             )
         self._check_rays()
         self._check_observables()
@@ -102,7 +104,7 @@ class StudyContent(Section, ABC):
         reserved = (sections.OFFSET, sections.FREE_OFFSET, sections.TX_OFFSET)
         for name in self.nuisance:
             if name in reserved or name.endswith(sections.OF_ALL_LINKS):
-                raise InputError(f"nuisance.{name}: Calibray has a term of this name; choose another")
+                raise InputError(f"nuisance.{name}: Calibray has a term with this name; choose another name")
         if getattr(self.engine, "rays", None) and (
             self.links.mountings or self.links.position_error_m is not None
         ):
@@ -130,13 +132,13 @@ class StudyContent(Section, ABC):
         key = _first_stated(refused)
         if isinstance(getattr(self.engine, "rays", None), str) and self.links.frequency is not None:
             raise InputError(
-                "engine.rays with links.frequency: a ray table states powers at one carrier; leave out "
-                "links.frequency, or make a study and an export for each carrier"
+                "engine.rays with links.frequency: a ray table contains powers at one carrier; remove links.frequency, "
+                "or create a study and an export for each carrier"
             )
         if self.engine.exports_rays and key is not None:
             raise InputError(
-                "engine.rays = true: powers of rays are added and compared at one carrier; it cannot be combined with "
-                f"{key}; remove one of them"
+                f"engine.rays = true: powers of rays are added and compared at one carrier, which excludes {key}; "
+                "remove one of the two"
             )
 
     def _laws(self) -> dict[str, bool]:
@@ -146,7 +148,7 @@ class StudyContent(Section, ABC):
         }
 
     def _without_replay(self) -> dict[str, bool]:
-        """Keys that are incompatible with replay of sums of powers at one carrier, and whether each is stated."""
+        """Keys that are incompatible with replay of power sums at one carrier, and whether each key is stated."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
@@ -159,8 +161,8 @@ class StudyContent(Section, ABC):
             return
         if getattr(self.engine, "compress_db", None) is not None:
             raise InputError(
-                "engine.compress_db: few weighted paths keep path loss, but not the delays and angles of "
-                "[observables]; remove one of them"
+                "engine.compress_db: compression to a few weighted paths preserves path loss, but not the delays and "
+                "angles of [observables]; remove one of the two"
             )
         if self.engine.name == "retrace":
             raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
@@ -168,8 +170,8 @@ class StudyContent(Section, ABC):
         if self.engine.expensive and (unstated or (self.links.std is None and self.noise.std_db is None)):
             missing = f"observables.{unstated[0]}.std" if unstated else "noise.std_db"
             raise InputError(
-                f"{missing}: is required, because observables are weighted by their errors, and the engine "
-                f"{self.engine.name!r} has too few calls to estimate them"
+                f"{missing}: is required, because observables are weighted by their errors, which cannot be estimated "
+                f"from the few calls of the engine {self.engine.name!r}"
             )
 
     def _check_losses(self) -> None:
@@ -180,13 +182,15 @@ class StudyContent(Section, ABC):
                     f"parameters: {name!r}: no [regions.{region}]; {did_you_mean(region, self.regions)}"
                 )
         if self.facades and getattr(self.engine, "rays", None):
-            raise InputError("engine.rays: rays of a table have no walls; remove [facades]")
+            raise InputError("engine.rays: the rays of a table are not assigned to walls; remove [facades]")
         if len({item.cluster_m for item in self.nuisance.values()} - {None}) > 1:
-            raise InputError("nuisance: cluster_m differs between terms; state one side of squares for all")
+            raise InputError(
+                "nuisance: cluster_m differs between terms; state the same side length for all of them"
+            )
         for name, section in self.nuisance.items():
             if section.by == REGION and not self.regions:
                 raise InputError(
-                    f"nuisance.{name}.by = {REGION!r}: there are no [regions] that lines could cross"
+                    f"nuisance.{name}.by = {REGION!r}: there are no [regions] for the straight lines to cross"
                 )
         rough = [name for name in self.parameters if name.endswith(f".{ROUGHNESS}")]
         rough += [
@@ -202,7 +206,8 @@ class StudyContent(Section, ABC):
                 )
             if used and getattr(self.engine, "compress_db", None) is not None:
                 raise InputError(
-                    f"engine.compress_db: few weighted paths cannot be combined with {key}; remove one of them"
+                    f"engine.compress_db: compression to a few weighted paths cannot be combined with {key}; remove "
+                    "one of the two"
                 )
 
     def _check_position_errors(self) -> None:
@@ -213,7 +218,7 @@ class StudyContent(Section, ABC):
         key = _first_stated(stated | self._without_replay())
         if key is not None:
             raise InputError(
-                f"links.position_error_m: powers at displaced receivers are averaged in replay, at one carrier; it "
+                "links.position_error_m needs replay at one carrier, which averages powers at displaced receivers; it "
                 f"cannot be combined with {key}"
             )
         if links.std is None and self.noise.std_db is None:
@@ -229,7 +234,10 @@ class StudyContent(Section, ABC):
                 f"parameters: {names[0]!r} needs [links.tx_antenna], the stated directions of the transmit antennas"
             )
         if names and getattr(self.engine, "compress_db", None) is not None:
-            raise InputError("engine.compress_db: few weighted paths have no direction; remove it")
+            raise InputError(
+                f"engine.compress_db: a few weighted paths have no directions, which {names[0]!r} needs; remove "
+                "engine.compress_db"
+            )
 
     def _check_displacements(self) -> None:
         names, links = [name for name in self.parameters if displaces(name)], self.links
@@ -268,8 +276,8 @@ class StudyContent(Section, ABC):
             parameters.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
             if entry.spread is not None and not name.startswith(f"{POSE}{EVERY}."):
                 raise InputError(
-                    f"{name}: spread describes a population of transmitters; give it to '{POSE}{EVERY}.azimuth' or "
-                    f"another field, or remove it"
+                    f"{name}: spread describes a population of transmitters; state it for '{POSE}{EVERY}.azimuth' or "
+                    "another field, or remove it"
                 )
             if entry.prior is not None and entry.prior.std is not None:
                 if not name.startswith((POSE, RECEIVER)):
@@ -288,8 +296,10 @@ class StudyContent(Section, ABC):
                 f"{name}: prior.like = {like!r}: is not another parameter; {did_you_mean(like, others)}"
             )
         if split_name(like)[1] != split_name(name)[1]:
-            raise InputError(f"{name}: prior.like = {like!r}: must be of the same constant")
+            raise InputError(f"{name}: prior.like = {like!r}: must be a parameter of the same constant")
         if other.prior is not None and other.prior.like is not None:
-            raise InputError(f"{name}: prior.like = {like!r}: has its own prior.like; name that one")
+            raise InputError(
+                f"{name}: prior.like = {like!r}: is itself centred on another parameter; name that parameter"
+            )
         if not other.bounds[0] > 0:
             raise InputError(f"{name}: prior.like = {like!r}: its lower bound must be greater than 0")

@@ -1,7 +1,7 @@
 """Positions as parameters (heights of transmitters, displacements of devices), and errors of receiver positions.
 
-Path loss is traced at the stated positions and at displaced positions. Between them, its change [dB] is a monotone
-cubic function of the displacement, for every link and axis.
+Paths are traced at the stated positions and at displaced positions. Between these positions, the change in path loss
+[dB] is a monotone cubic function of the displacement, for every link and axis.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ AXES: Final = {"dx": 0, "dy": 1, "height": 2}
 """Axis of the scene along which each field displaces an antenna."""
 
 LEAST: Final = 0.01
-"""Smallest distance of the outermost neighbour [m], which keeps knots apart at the bounds."""
+"""Smallest distance of the outermost neighbour [m], so that knots at the bounds do not coincide."""
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
-"""Displacements on each side that are traced before the calibration, as shares of the largest displacement. With panels
-of eight rows and traced heights 2 m apart, the interpolated path loss has an error of 0.1 dB (median) and 2 dB (RMS); a
-parabola through both bounds of 8 m has 5 dB RMS."""
+"""Displacements on each side that are traced before the calibration, as shares of the largest displacement. For panels
+of eight rows and traced heights 2 m apart, the error of the interpolated path loss is 0.1 dB (median) and 2 dB (RMS).
+The RMS error of a parabola through both bounds of 8 m is 5 dB."""
 
 
 def displaces(name: str) -> bool:
@@ -56,10 +56,11 @@ class Displacement:
 
     Attributes:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
-        weights: 1 where a parameter displaces a group of links [G, parameters].
+        weights: 1 if a parameter displaces a group of links, otherwise 0 [G, parameters].
         group: Group of every link [L].
-        reach: Largest displacement of every group by one of its parameters [G], [m]; it also limits sums.
-        ground: The ground that receivers follow; None if their heights are not measured from it.
+        reach: Largest displacement of every group by one of its parameters [G], [m]; also the limit of sums of
+            displacements.
+        ground: The ground above which receivers keep their height; None if heights are not measured from the ground.
     """
 
     field: str
@@ -83,8 +84,8 @@ class Displacement:
 
         Args:
             values: Values of the parameters [d] at which the displacement is 0.
-            neighbours: Displacements on each side, as shares of the largest displacement. Where these exceed the
-                bounds, displacements are equidistant up to the bounds.
+            neighbours: Displacements on each side, as shares of the largest displacement. Displacements that would
+                exceed the bounds are equidistant up to the bounds.
         """
         shares = np.array(neighbours)
         equidistant = np.arange(1, len(shares) + 1) / max(len(shares), 1)
@@ -99,7 +100,7 @@ class Displacement:
 
 
 def follow(ground: Ground | None, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
-    """Keep the height of displaced positions [n, 3], [m], above the ground; where there is no ground, keep z."""
+    """Keep the height of displaced positions [n, 3], [m], above the ground. Without ground, z is unchanged."""
     if ground is None:
         return
     with np.errstate(invalid="ignore"):  # inf - inf where there is no ground
@@ -113,10 +114,10 @@ def displacements(
     columns: Mapping[str, str | None],
     ground: Ground | None = None,
 ) -> tuple[Displacement, ...]:
-    """The displacements of links, one for each axis along which parameters displace them.
+    """The displacements of links, one for each axis along which parameters displace links.
 
-    Receivers of links without measured values have exact positions and are not displaced. `columns` has the columns of
-    the names of transmitters ("tx:") and devices ("rx:").
+    Receivers of links without measured values have exact positions and are not displaced. `columns` contains the names
+    of the columns of transmitters ("tx:") and devices ("rx:").
 
     Raises:
         InputError: A column is missing.
@@ -146,10 +147,10 @@ def displacements(
 def check_labels(
     source: str, names: Mapping[str, object], links: Measurements, kind: str, column: str | None
 ) -> None:
-    """Raise an error for parameters of transmitters ("tx:") or devices ("rx:") that no link has.
+    """Check that links have the transmitters ("tx:") or devices ("rx:") to which parameters refer.
 
     Raises:
-        InputError: A transmitter or device is unknown, or the column of their names is missing.
+        InputError: A transmitter or device is unknown, or the column of names is missing.
     """
     stated = {name.removeprefix(kind).rpartition(".")[0]: name for name in names if name.startswith(kind)}
     for label in (EVERY, NEW):
@@ -174,15 +175,16 @@ def displacement_loss(
     here: tuple[Paths, Effects],
     traced: Callable[[Measurements], tuple[Paths, Effects]],
 ) -> DisplacementLoss:
-    """The change of path loss by displacements, from one trace of the links at all neighbouring positions.
+    """The change in path loss due to displacements, from one trace of the links at all neighbouring positions.
 
     Args:
         displacements: The K displacements.
-        placed: The study's parameters, and their values at which the paths are traced [d].
-        neighbours: Distances of the n neighbours on each side, as shares of the largest displacement, ascending.
+        placed: The parameters of the study, and the parameter values at which the paths are traced [d].
+        neighbours: Distances of the n neighbours on each side, as ascending shares of the largest displacement.
         links: The L links at these values.
-        here: Their paths, and other effects on the paths.
-        traced: Gives paths and effects for displaced links, whose number may differ from L.
+        here: The paths of these links, and other effects on the paths.
+        traced: Function that returns the paths of displaced links, and effects on the paths. The number of these links
+            can differ from L.
     """
     # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.engines.replay import Computation, Replay
@@ -218,7 +220,7 @@ def displacement_loss(
 
 
 def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
-    """Select links by index; indices may be repeated."""
+    """Select links by index; indices can be repeated."""
     table = links.table
     return Measurements(
         tx=links.tx[index],
@@ -229,7 +231,7 @@ def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
 
 
 def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes of path loss [K, 2n + 1, L], [dB]; where there is no path, the change at the next position inwards."""
+    """Changes in path loss [K, 2n + 1, L], [dB]; without a path, the change at the next position inwards."""
     change_db, middle = change_db.copy(), change_db.shape[1] // 2
     for step in range(1, middle + 1):
         for side in (1, -1):
@@ -253,16 +255,16 @@ def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArra
 
 
 DIRECTIONS: Final = np.sqrt(2.0) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-"""Displacements in units of the error's standard deviation: means over them equal means over a Gaussian error up to
-cubic terms (Stroud's spherical rule of degree three in the plane)."""
+"""Displacements in units of the standard deviation of the error. Means over these displacements equal means over a
+Gaussian error up to cubic terms (Stroud's spherical rule of degree three in the plane)."""
 
 
 def displaced(
     links: Measurements, error_m: NDArray[np.float64], ground: Ground | None = None
 ) -> Measurements:
-    """Links to displaced receivers, one direction after another; `error_m` has standard deviations [L], [m].
+    """Links to displaced receivers, ordered by direction; `error_m` is the standard deviation of the error [L], [m].
 
-    If there is a `ground`, receivers keep their height above it.
+    With a `ground`, receivers keep their height above the ground.
     """
     stated = np.tile(links.rx, (len(DIRECTIONS), 1))
     rx = stated.copy()
@@ -273,9 +275,9 @@ def displaced(
 
 
 def averaged(paths: Paths, links: Measurements) -> Paths:
-    """Assign paths to displaced receivers to the original links, with power sums equal to the mean over the receivers.
+    """Assign the paths of displaced receivers to the original links; the sum of powers is the mean over the receivers.
 
-    Displaced receivers without a path are left out of the mean.
+    Displaced receivers without a path are excluded from the mean.
     """
     count, directions = len(links), len(DIRECTIONS)
     reached = np.bincount(paths.link, minlength=paths.num_links).reshape(directions, count) > 0
@@ -297,7 +299,7 @@ def mounted_at_displaced(mountings: Mapping[str, Mounting], count: int) -> dict[
 def spread_db(path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviation of path loss over the displacements of each link [L], [dB].
 
-    It is 0 if only one displaced receiver has a path.
+    The result is 0 if only one displaced receiver has a path.
     """
     loss = path_loss_db.reshape(len(DIRECTIONS), -1)
     reached = np.isfinite(loss)

@@ -1,6 +1,6 @@
-"""Drafts a study from a scene and a table of links: TOML with the reason of every assumption as a comment.
+"""Drafts a study from a scene and a table of links: TOML with the reason for every assumption as a comment.
 
-Names of columns, groups and files come from foreign tables; `study_text` quotes them, so that no name becomes TOML.
+Names of columns, groups and files are user input. `study_text` quotes these names, so that none is interpreted as TOML.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ AVERAGING_WAVELENGTHS: Final = 40
 """Width of the cells over which fading is averaged [wavelengths] (Lee 1985; see `calibray.measurements.reading`)."""
 
 PLACE_SAMPLES: Final = 20
-"""Median number of samples at one position above which samples are averaged by position: a stationary scan. The
+"""Median number of samples at one position above which samples are averaged by position, as in a stationary scan. The
 logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
-"""Smallest share of values equal to the lowest value that indicates a receiver that clips them."""
+"""Smallest share of values equal to the lowest value that indicates clipping by the receiver."""
 
 CLIPPED_RATIO: Final = 10
-"""Smallest ratio of the number of values equal to the lowest to the median count of any other value."""
+"""Smallest ratio of the count of the lowest value to the median count of the other values that indicates clipping."""
 
 MISSING_SHARE: Final = 0.1
-"""Share of missing powers of a device above which its lowest power is taken as its noise floor."""
+"""Share of missing powers of a device above which the lowest power of the device is used as its noise floor."""
 
 FEWEST_OF_DEVICE: Final = 20
-"""Smallest number of powers of such a device: in 88 % of cases, the lowest of 20 is in the lowest tenth."""
+"""Smallest number of powers of such a device. The lowest of 20 powers is in the lowest tenth in 88 % of cases."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
-    """Draft ``[links]``; arguments as for `LinksDraft`.
+    """Draft ``[links]``; the arguments are those of `LinksDraft`.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
@@ -85,15 +85,15 @@ def _value(draft: LinksDraft) -> ValueColumn:
     draft.assume("links.value", value.column, value.reason)
     reason = "by name and sign"
     if value.quantity == "rsrp":
-        reason = "the transmitted power is unknown, and is part of [offset]"
+        reason = "the transmitted power is unknown and becomes part of [offset]"
     draft.assume("links.quantity", value.quantity, reason)
     return value
 
 
 def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
-    """Column of EIRP or transmitted power by its key in ``[links]``; empty if there is none.
+    """Column of the EIRP or the transmitted power, by its key in ``[links]``; empty if there is no such column.
 
-    Tables of transmitters state the power of the whole carrier, of which a reference signal is only a part.
+    Tables of transmitters state the power of the whole carrier; a reference signal has only a part of this power.
     """
     power = column_names.find_transmit_power(draft.table.frame)
     if power is not None:
@@ -105,7 +105,7 @@ def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
 
 
 def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
-    """The columns that group the offset."""
+    """The columns of labels that group the offset."""
     if value.quantity != "rsrp":
         draft.assume("offset", "one for all links", "the values include cables and unknown antenna gains")
         return []
@@ -119,7 +119,7 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
     ]
     reasons = [] if devices else ["no column of devices was found"]
     if ends:
-        reasons.append(f"{' and '.join(ends)} has its own gain")
+        reasons.append(f"{' and '.join(ends)} has a different gain")
     groups = [*([name] if name else []), *devices, *carriers]
     groups = list(dict.fromkeys(groups))
     draft.assume("offset.per", ", ".join(groups) or "one", "; ".join(reasons))
@@ -173,7 +173,7 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
 
 
 def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Series) -> None:
-    """Leave out rows at the largest power that a saturated receiver reports for all stronger powers."""
+    """Leave out rows with the largest power, which a saturated receiver reports for all larger powers."""
     share = _share_at_lowest(-column)
     if share > 0:
         name, highest = value.column, float(column.max())
@@ -183,7 +183,7 @@ def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Serie
 
 
 def _share_at_lowest(values: pd.Series) -> float:
-    """Share of the values that equal the lowest one, if a receiver reports it for all weaker powers; otherwise 0."""
+    """Share of the lowest value if a receiver reports this value for all lower powers; otherwise 0."""
     counts = values.value_counts().sort_index()
     share = counts.iloc[0] / counts.sum()
     if share >= CLIPPED_SHARE and counts.iloc[0] >= CLIPPED_RATIO * counts.iloc[1:].median():
@@ -192,7 +192,7 @@ def _share_at_lowest(values: pd.Series) -> float:
 
 
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
-    """Average samples along tracks and where positions repeat; by position if scans are stationary."""
+    """Average samples along tracks and at repeated positions; average by position if the scans are stationary."""
     frame, name = draft.table.frame, draft.section.get("transmitter")
     heights = [] if rx.height is None else [rx.height]
     keys = [rx.x, rx.y, *heights, *draft.groups, *([name] if name and name not in draft.groups else [])]
@@ -234,7 +234,7 @@ def _add_flight_times(draft: LinksDraft) -> None:
     draft.assume(
         "observables.flight",
         column,
-        f"its name; the bias of {'each ' if bias != 'all' else ''}device is unknown",
+        f"by its name; the bias of {'each ' if bias != 'all' else ''}device is unknown",
     )
 
 
@@ -248,7 +248,7 @@ class Draft:
 
     Attributes:
         text: The study file.
-        study: The study that the text states.
+        study: The study that the text describes.
         assumptions: The assumptions, in the order of the file.
     """
 
@@ -258,9 +258,10 @@ class Draft:
 
 
 def draft(scene: str, links: str | Path, target: str | Path, given: Given | None = None) -> Draft:
-    """Draft a study of a scene, its XML file or `sionna:NAME`, and a table of links; nothing is written.
+    """Draft a study from a scene, its XML file or `sionna:NAME`, and a table of links; no file is written.
 
-    Files are named relative to the folder of `target`, the future study file. `given` states what else is known.
+    Files are named relative to the folder of `target`, the future study file. `given` contains what the user states in
+    addition.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
@@ -279,7 +280,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
     indoors = _indoors(links)
     if section.get("position") == "geographic" and not indoors:
         section["inside"] = "move"
-        reason = "satellite positions have errors of metres, some are inside walls"
+        reason = "satellite positions have errors of metres, and some are inside buildings"
         # Displaced receivers are averaged at one carrier.
         reason += "" if "frequency" in section else "; position_error_m models them"
         links.assume("links.inside", "move", reason)
@@ -305,14 +306,14 @@ def _content(links: LinksDraft) -> dict[str, Any]:
 
 
 def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
-    """Hold out blocks in turn if there are enough links per unknown, and enough receiver positions in each block."""
+    """Hold out blocks in turn if there are enough links per unknown and enough receiver positions per block."""
     study = Study.from_content(content, links.target)
     measured = study.measurements()
     places = len(np.unique(measured.rx[:, :2], axis=0))
     if count_unknowns(study, measured) or places < DEFAULT_BLOCKS * LINKS_PER_UNKNOWN:
         return
     content["holdout"] = {"blocks": DEFAULT_BLOCKS}
-    reason = "each block of neighbouring links is predicted from the others; the errors decide the prediction model"
+    reason = "each block of neighbouring links is predicted from the others; the errors determine the prediction model"
     links.assume("holdout.blocks", DEFAULT_BLOCKS, reason)
 
 
@@ -337,9 +338,9 @@ def _depth(links: LinksDraft) -> int:
 
 
 def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
-    """The scene, and constants for materials for which ITU-R P.2040 has no law at the carrier.
+    """The scene, and the constants of materials without an ITU-R P.2040 law at the carrier.
 
-    The constants are those of the law at the nearest frequency that it covers.
+    These constants are computed from the law of the material at the nearest frequency that the law covers.
     """
     try:
         return read_scene(links.scene, links.frequency), {}
@@ -359,7 +360,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
 
 
 def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The region of the trees next to the scene, and its parameter if they are on the straight line of a link."""
+    """The region of the trees next to the scene, and its parameter if trees are on the straight line of a link."""
     file = Path(links.scene).parent / TREES_FILE
     # Next to other scenes, a file of this name need not have the columns that `calibray scene` writes.
     if links.scene.startswith(BUNDLED) or read_frame(links.scene) is None or not exists(file):
@@ -370,14 +371,14 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
     section = RegionSection.model_validate_json(json.dumps(content))
     region, measured = section.region(file, Place(links.frame, lambda: links.overhead)), links.measurements()
     crossing = int((region.length_inside(measured.tx, measured.rx) > 0).sum())
-    reason = f"trees are on the straight line of {crossing} of {len(measured)} links; typical of dense trees in leaf"
+    reason = f"trees on the straight lines of {crossing} of {len(measured)} links; typical value of dense trees in leaf"
     links.assume("regions", f"trees, {specific:g} dB/m", reason)
     parameter = {"region:trees.specific_attenuation": {"bounds": [0.0, 3.0]}} if crossing else {}
     return {"trees": content}, parameter
 
 
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
-    """The entries of ``[parameters]``: permittivities, and indoors also conductivities, which determine wall losses."""
+    """The entries of ``[parameters]``: permittivities and, indoors, conductivities, which determine wall losses."""
     materials = {
         name: material
         for name, material in scene.materials.items()
@@ -387,7 +388,7 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
     # Links can seldom identify more than six materials.
     names = list(materials)[:6]
     if not names:
-        raise InputError(f"{links.scene}: no material to calibrate; all are metal or air")
+        raise InputError(f"{links.scene}: no material to calibrate; all materials are metal or air")
     entries: dict[str, dict[str, Any]] = {}
     for name in names:
         permittivity, conductivity = materials[name].relative_permittivity, materials[name].conductivity
@@ -407,7 +408,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     """Add the columns of transmit antennas to ``[links]``, and return the section ``[antennas]``.
 
     Raises:
-        InputError: The folder of antennas cannot be used, or has no file for an antenna.
+        InputError: The folder of antennas cannot be used or has no file for an antenna.
     """
     folder = links.given.antennas
     frame, of_transmitters = links.transmitter_rows, links.given.transmitters is not None
@@ -423,7 +424,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
             and key.startswith("electrical")
             and not matches(column, "additional")
         ):
-            cause = "it is part of the files' vertical cuts"
+            cause = "it is included in the vertical cuts of the files"
         if cause:
             links.assume(f"links.tx_antenna.{key}", "none", f"column {column}: {cause}")
             continue
@@ -438,18 +439,18 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         name for name in links.table.frame if matches(name, "receiver") and matches(name, "azimuth")
     ):
         reason = (
-            f"column {column} may describe a phone; state it and the pattern if the antenna is directional"
+            f"column {column} may describe a phone; if the antenna is directional, state column and pattern"
         )
         links.assume("links.rx_antenna.azimuth_deg", "none", reason)
     name = transmitter_columns.find_antenna_names(frame) if of_transmitters else None
     if folder is not None:
         reason = f"files of {folder.resolve().name}; the receiver's antenna is unknown"
     elif "azimuth_deg" in mount:
-        reason = "azimuths are stated: 3GPP's 65-degree sectors, iso receivers"
+        reason = "azimuths are stated: 3GPP sectors of 65 degrees and isotropic receivers"
     else:
-        reason = "unknown; state your antennas with their orientation"
+        reason = "unknown; state the antennas and their orientations"
     if folder is None and name is not None:
-        reason += f"; give --antennas, a folder of the MSI files that column {name} names"
+        reason += f"; give a folder of the MSI files named in column {name} with --antennas"
     links.assume(
         "antennas", f"{antennas['tx']['pattern']}, V" if folder is None else folder.resolve().name, reason
     )
@@ -457,36 +458,40 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
 
 
 def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[str, Any]:
-    """Antennas by name in a column, with the files of these names; a single file is used for all transmitters."""
+    """Antennas with the files named in a column of the transmitters; a single file is used for all transmitters."""
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in TWO_CUT_SUFFIXES)
     except OSError as error:
         raise InputError(f"--antennas {folder}: cannot be read ({error}); give a folder") from None
     if not files:
-        raise InputError(f"--antennas {folder}: has no file *.msi, *.pln or *.ant; export the antennas there")
+        raise InputError(
+            f"--antennas {folder}: contains no file *.msi, *.pln or *.ant; export the antennas to this folder"
+        )
     by_name = {plain_name(file.name): file for file in files}
     column = transmitter_columns.find_antenna_names(links.transmitter_rows, by_name)
     if column is None and len(files) == 1:
         return {"tx": _antenna(links, files[0])}
     if column is None:
         raise InputError(
-            f"--antennas {folder}: no column of {links.given.transmitters or links.links} names the antennas; add one "
-            f"with names such as {files[0].stem!r}, or keep one file"
+            f"--antennas {folder}: no column of {links.given.transmitters or links.links} contains the names of the "
+            f"antennas; add a column with names such as {files[0].stem!r}, or keep only one file"
         )
     labels = sorted(links.transmitter_rows[column].astype(str).unique().tolist())
     lacking = [label for label in labels if plain_name(label) not in by_name]
     if lacking:
         raise InputError(
-            f"--antennas {folder}: no file for {', '.join(map(repr, lacking[:5]))} of column {column!r}; its files are "
-            f"{', '.join(file.name for file in files[:5])}; rename them, or the antennas"
+            f"--antennas {folder}: no file for {', '.join(map(repr, lacking[:5]))} of column {column!r}; the files are "
+            f"{', '.join(file.name for file in files[:5])}; rename the files or the antennas"
         )
     mount["type"] = column
-    links.assume("links.tx_antenna.type", column, f"{len(labels)} antennas, each with a file of its name")
+    links.assume(
+        "links.tx_antenna.type", column, f"{len(labels)} antennas, each with a file of the same name"
+    )
     return {"types": {label: _antenna(links, by_name[plain_name(label)]) for label in labels}}
 
 
 def _antenna(links: LinksDraft, file: Path) -> dict[str, str]:
-    """An antenna with the pattern of a file, which must be readable."""
+    """An antenna with the pattern of a file; the file must be readable."""
     read_gain_table(file)
     return {"pattern": links.relative(file), "polarization": "V"}
 
@@ -497,7 +502,7 @@ def schema_text() -> str:
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema, draft 2020-12; the first line of each docstring describes a table."""
+    """The JSON Schema (draft 2020-12) of a study, with the first line of each docstring as a description."""
     content = Study.model_json_schema()
     _shorten(content)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Calibray study"} | {
@@ -506,7 +511,7 @@ def schema() -> dict[str, Any]:
 
 
 def _shorten(node: Any) -> None:
-    """Keep only the first line of each description; the rest describes the attributes of Python classes."""
+    """Keep only the first line of each description. The other lines describe the attributes of Python classes."""
     if isinstance(node, dict):
         if isinstance(node.get("description"), str):
             node["description"] = node["description"].split("\n\n")[0].replace("\n", " ").replace("``", "")

@@ -1,4 +1,4 @@
-"""Drafts a study's ``[links]``: its track, transmitters, carrier and positions, with a reason for each assumption."""
+"""Drafts the section ``[links]``: track, transmitters, carrier and positions, with a reason for each assumption."""
 
 from __future__ import annotations
 
@@ -37,16 +37,18 @@ from calibray.study.study import Study
 from calibray.support.messages import counted
 
 RECEIVER_HEIGHT: Final = 1.5
-"""Height of a receiver without a column of heights [m]: a phone in the hand."""
+"""Default height of a receiver without a column of heights [m], for a handheld phone."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn"})
-"""Words in names of altitude columns. Satellite receivers measure altitudes from sea level, drones also from ground."""
+"""Words in the names of altitude columns. Satellite receivers report altitudes above sea level; drones also report
+altitudes above ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
-"""Height of a transmitter without a column of heights [m]: a small cell on a mast."""
+"""Default height of a transmitter without a column of heights [m], for a small cell on a mast."""
 
 SAME_CARRIER: Final = 0.01
-"""Largest relative difference between carriers that count as one: free-space loss changes by 0.09 dB."""
+"""Largest relative difference between carriers that are treated as one carrier. This difference changes free-space loss
+by 0.09 dB."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Assumption:
     """One assumption of a draft.
 
     Attributes:
-        what: Key of the study to which it applies.
+        what: Key of the study to which the assumption applies.
         value: The assumed value.
         reason: The reason.
     """
@@ -66,15 +68,15 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Given:
-    """What a user states in addition to the scene and the table of links.
+    """Input of a user in addition to the scene and the table of links.
 
     Attributes:
-        transmitters: Table of the transmitters' positions, unless the links have them.
-        track: GPX track with the position of each row, unless the links contain it.
+        transmitters: Table of the transmitters' positions, unless the table of links contains them.
+        track: GPX track with the positions of the rows, unless the table of links contains them.
         antennas: Folder of MSI files named after the transmitters' antennas.
-        tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table contains it.
-        frequency: Carrier frequency [Hz], unless the links have it.
-        origin: Longitude and latitude of the scene's origin [deg], unless the scene file states its frame.
+        tx: Transmitter position (x, y, z) [m] in the scene frame, unless a table contains it.
+        frequency: Carrier frequency [Hz], unless a table contains it.
+        origin: Longitude and latitude of the scene's origin [deg], unless the scene file contains them.
     """
 
     transmitters: Path | None = None
@@ -87,7 +89,7 @@ class Given:
 
 @dataclass
 class LinksDraft:
-    """The draft of ``[links]``. Each method adds the keys of one topic and records its assumptions.
+    """The draft of ``[links]``. Each method adds the keys of one topic and records the assumptions.
 
     Attributes:
         scene: Mitsuba XML file, or `sionna:NAME`.
@@ -98,10 +100,10 @@ class LinksDraft:
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
         table: The links.
-        sites: The transmitters of the links; None without their table.
+        sites: The table of transmitters, limited to those of the links; None without such a table.
         rx: Columns of the receivers' positions.
-        tx: Columns of the transmitters' positions; None without columns.
-        groups: The columns whose labels group the offset.
+        tx: Columns of the transmitters' positions; None if there are no such columns.
+        groups: The columns of labels that group the offset.
         observables: The sections of ``[observables]``.
     """
 
@@ -128,12 +130,12 @@ class LinksDraft:
 
     @cached_property
     def overhead(self) -> SceneSurfaces:
-        """Surfaces of the scene: the ground below and the roofs above positions."""
+        """Surfaces of the scene: the ground below positions and the roofs above them."""
         return SceneSurfaces.read(self.scene)
 
     @cached_property
     def frame(self) -> Frame | None:
-        """The position of the scene on the globe; None if neither the user nor the scene file states it."""
+        """The georeference of the scene; None if neither the user nor the scene file states one."""
         return read_frame(self.scene) if self.given.origin is None else Frame.local(*self.given.origin)
 
     @property
@@ -144,7 +146,7 @@ class LinksDraft:
 
     @property
     def transmitter_rows(self) -> pd.DataFrame:
-        """The table of transmitters, with columns named as in the links; the links if there is no such table."""
+        """The table of transmitters, with columns renamed as in the links. Without such a table, the table of links."""
         if self.sites is None:
             return self.table.frame
         return self.sites.frame.rename(columns=self._name_in_links)
@@ -173,24 +175,25 @@ class LinksDraft:
         return ", ".join(map(str, self.table.frame))
 
     def _add_track(self) -> None:
-        """Positions from a track, by the time of each row."""
+        """Add the positions of a track at the times of the rows."""
         if self.given.track is None:
             return
         name = column_names.find_time(self.table.frame)
         if name is None:
             raise InputError(
-                f"{self.links}: no column of times, which {self.given.track} needs ({self._columns()}); name one 'time'"
+                f"{self.links}: no column of times ({self._columns()}), which {self.given.track} requires; name this "
+                "column 'time'"
             )
         self.section["track"] = {"file": self.relative(self.given.track), "time": name}
         rows = len(self.table)
         self.table = select_rows(self.table, Preparation(track=Track(str(self.given.track), name)))
         reason = f"given; it covers {len(self.table)} of {rows} rows"
         if not re.search(r"(Z|[+-]\d\d(:?\d\d)?|^[\d.]+)$", str(self.table.frame[name].iloc[0])):
-            reason += "; times without a time zone count as UTC"
+            reason += "; times without a time zone are read as UTC"
         self.assume("links.track", f"{self.given.track.name} by {name}", reason)
 
     def _add_transmitters(self) -> None:
-        """Match transmitters with their table, by a common column or by one column of values per transmitter."""
+        """Match the rows with the table of transmitters, by a common column or by the columns of a wide table."""
         if self.sites is None or self.given.transmitters is None:
             return
         self.section["transmitters"] = self.relative(self.given.transmitters)
@@ -200,7 +203,7 @@ class LinksDraft:
         if key is not None:
             name, of_table = key
             reason = f"its values are in column {of_table} of {self.given.transmitters.name}"
-            reason = reason if shared is None else "a column of both tables with common values"
+            reason = reason if shared is None else "both tables have this column, with common values"
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, reason)
             self._leave_out_unknown_transmitters(name, self.sites.frame[of_table])
@@ -213,15 +216,15 @@ class LinksDraft:
         name, columns = max(wide.items(), key=lambda item: len(item[1]))
         if not columns:
             raise InputError(
-                f"{self.links}: no column names the transmitter of a row, and no columns are named like the "
-                f"transmitters of {self.given.transmitters}; give both tables one column of the same name"
+                f"{self.links}: no column contains the transmitters of the rows, and no columns have the names of the "
+                f"transmitters in {self.given.transmitters}; give both tables a column with the same name"
             )
         self.section |= {"wide": columns, "transmitter": name}
         self._transmitter_key = name
         self._keep_used_transmitters(name, columns.values())
-        reason = f"named as in {self.given.transmitters.name}"
+        reason = f"names as in {self.given.transmitters.name}"
         if unknown := transmitter_columns.find_unknown_wide_columns(self.table.frame, columns):
-            reason += f", which lacks the transmitters of {', '.join(unknown)}: left out"
+            reason += f"; without {', '.join(unknown)}, which this table lacks"
         self.assume("links.wide", ", ".join(columns), reason)
         codes = find_codes(self.table.frame[list(columns)].apply(pd.to_numeric, errors="coerce"))
         self.assume_codes(codes, ", ".join(columns))
@@ -229,13 +232,16 @@ class LinksDraft:
         self.table = select_rows(self.table, steps, transmitter_columns.name_melted_values(columns))
 
     def _keep_used_transmitters(self, key: str, names: Iterable[object]) -> None:
-        """Keep only the transmitters of the links: a network's table also has others, with different antennas."""
+        """Keep only the transmitters of the links.
+
+        The table of a network also contains other transmitters, with different antennas.
+        """
         if self.sites is not None:
             compared = comparison(self.sites.frame[key])
             self.sites = self.sites.select(np.isin(compared(self.sites.frame[key]), compared(names)))
 
     def _leave_out_unknown_transmitters(self, key: str, names_of_sites: pd.Series) -> None:
-        """Draft a filter for rows whose transmitter the table of transmitters lacks."""
+        """Draft a filter that excludes rows with a transmitter that is not in the table of transmitters."""
         column, compared = self.table.frame[key], comparison(names_of_sites)
         lacking = ~np.isin(compared(column), compared(names_of_sites))
         if not lacking.any():
@@ -250,7 +256,7 @@ class LinksDraft:
         self._leave_out(lacking, f"{source} lacks {named}" if names else "no transmitter is stated")
 
     def _leave_out_unplaced_receivers(self) -> None:
-        """Draft a filter for rows without a receiver position, such as those logged before satellites were found."""
+        """Draft a filter that excludes rows without a receiver position, such as rows without a satellite fix."""
         names = [name for name in (self.rx.x, self.rx.y, self.rx.height) if name is not None]
         missing = self.table.frame[names].isna()
         lacking = missing.any(axis=1).to_numpy()
@@ -261,7 +267,7 @@ class LinksDraft:
         self._leave_out(lacking, "no receiver position")
 
     def _leave_out(self, rows: NDArray[np.bool_], cause: str) -> None:
-        """Leave out the rows that the drafted filter excludes, and count them."""
+        """Remove the rows that the drafted filter excludes, and record their number."""
         number = int(rows.sum())
         reason = f"{cause}: {counted(number, 'row')} {'is' if number == 1 else 'are'} left out"
         self.assume("links.where", self.section["where"], reason)
@@ -274,14 +280,18 @@ class LinksDraft:
         self.section["where"] = condition if where is None else f"({where}) and {condition}"
 
     def assume_codes(self, codes: Sequence[float], columns: str) -> None:
-        """Record numbers that mean that nothing was measured."""
+        """Record numbers that represent missing measurements."""
         if codes:
             self.section["missing"] = list(codes)
             listed = ", ".join(f"{code:g}" for code in codes)
-            self.assume("links.missing", listed, f"far from all other values of {columns}: not measured")
+            self.assume(
+                "links.missing",
+                listed,
+                f"far from all other values of {columns}, therefore treated as missing",
+            )
 
     def _frequency(self) -> float:
-        """The study's carrier: the given one, or one stated in a column of the links or the transmitters."""
+        """The carrier of the study, given by the user or stated in a column of the links or the transmitters."""
         given, stated = self.given.frequency, self._stated_frequency()
         if given is not None:
             differs = stated is not None and abs(stated[0] - given) >= SAME_CARRIER * given
@@ -296,7 +306,7 @@ class LinksDraft:
         return stated[0]
 
     def _stated_frequency(self) -> tuple[float, str] | None:
-        """A carrier stated in a table [Hz] and a description of it; several carriers become ``links.frequency``."""
+        """A carrier stated in a table [Hz] and its description; a column of carriers becomes ``links.frequency``."""
         rows, file = self.table.frame, self.links
         if column_names.find_frequency(rows) is None and self.given.transmitters is not None:
             rows, file = self.transmitter_rows, self.given.transmitters
@@ -316,22 +326,22 @@ class LinksDraft:
             return float(carriers[0]), f"lowest carrier of column {name}"
         if self.given.frequency is None:
             raise InputError(
-                f"{file}: column {name!r} has {len(carriers)} carriers; at most {MAX_CARRIERS} are calibrated "
-                "together, in Hz or a unit that the column's name states, such as frequency_mhz; or give --frequency "
-                "and a table of one carrier"
+                f"{file}: column {name!r} has {len(carriers)} carriers; at most {MAX_CARRIERS} can be calibrated "
+                "together, in Hz or in the unit stated in the name of the column, such as frequency_mhz; "
+                "alternatively, give --frequency and a table of one carrier"
             )
         return float(np.nanmedian(values)), f"median of column {name}"
 
     def _position_columns(self) -> tuple[PositionColumns, PositionColumns | None]:
-        """Columns of receiver and transmitter positions; None for the transmitters if they have no columns."""
+        """Columns of receiver and transmitter positions; None for the transmitters if there are no such columns."""
         if self.given.track is None:
             rx = column_names.find_position(self.table.frame, "rx", unnamed=True)
         else:
             rx = PositionColumns("geographic", *TRACK_COLUMNS, height=None)
         if rx is None:
             raise InputError(
-                f"{self.links}: no columns of receiver positions ({self._columns()}); name them rx_x, rx_y, rx_z [m], "
-                "or longitude and latitude"
+                f"{self.links}: no columns of receiver positions ({self._columns()}); name these columns rx_x, rx_y, "
+                "rx_z [m], or longitude and latitude"
                 f"{column_names.text_instead(self.table.frame, 'x', 'y', 'longitude', 'latitude')}"
                 f"{column_names.no_degrees(self.table.frame)}"
             )
@@ -349,7 +359,7 @@ class LinksDraft:
     def _projected(
         self, rx: PositionColumns, tx: PositionColumns | None
     ) -> tuple[PositionColumns, PositionColumns | None]:
-        """The columns, read as degrees or projected coordinates if only these place most positions on the scene."""
+        """The columns, as degrees or projected coordinates if this places most positions on the scene."""
         frame = self.frame if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
@@ -368,11 +378,11 @@ class LinksDraft:
         if crs is None:
             return rx, tx
         self.section["crs"] = crs
-        self.assume("links.crs", crs, f"{rx.x} and {rx.y} are on the scene in this projection")
+        self.assume("links.crs", crs, f"positions {rx.x}, {rx.y} are on the scene in this projection")
         return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
 
     def _name_in_links(self, column: str | None) -> str | None:
-        """Name of a transmitter column in the links: it is renamed if the links have a column of the same name."""
+        """Name of a transmitter column in the links, renamed if the links have a column of the same name."""
         taken = column in self.table.frame and column != self._transmitter_key
         return f"{self._transmitter_key}_{column}" if taken else column
 
@@ -386,27 +396,29 @@ class LinksDraft:
         self._add_position_unit(tx, rx)
         reason = f"column names indicate {unit}" if "position_unit" not in self.section else "by their names"
         if unit == "degrees" and not column_names.matches(rx.x, "longitude"):
-            reason = "its numbers are on the scene as degrees"
+            reason = "the positions are on the scene if read as degrees"
         if rx.height is None:
             reason += f"; no height: {RECEIVER_HEIGHT} m"
             unused = [str(name) for name in self.table.frame if column_names.words(name) & ALTITUDES]
             if unused:
-                reason += f" ({unused[0]} may be above sea level; name a height above the ground 'height')"
+                reason += (
+                    f" ({unused[0]} may be above sea level; rename it 'height' if it is above the ground)"
+                )
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
         if rx.position != "geographic":
             return
         self.section["position"] = "geographic"
         if self.frame is None:
             raise InputError(
-                f"{self.links}: positions are in degrees, but {self.scene} has no position on the globe; state the "
-                f"longitude and latitude of its origin, --origin LON,LAT, or make the scene with `calibray scene`"
+                f"{self.links}: positions are in degrees, but {self.scene} is not georeferenced; give the longitude "
+                "and latitude of its origin as --origin LON,LAT, or create the scene with `calibray scene`"
             )
         known = f"{Path(self.scene).name} has" if self.given.origin is None else "--origin states"
-        reason = f"{unit}; {known} the scene's position on the globe"
+        reason = f"{unit}; {known} the georeference of the scene"
         self.assume("links.position", "geographic", reason)
 
     def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
-        """The unit of the position columns, if their names state a unit other than the metre."""
+        """Add the unit of the position columns if their names state a unit other than the metre."""
         ends = [end for end in (tx, rx) if end is not None]
         if any(end.position == "geographic" for end in ends):
             names = [end.height for end in ends if end.height is not None]
@@ -424,21 +436,21 @@ class LinksDraft:
         if plain and rx.position != "geographic":
             raise InputError(
                 f"{self.links}: the columns {', '.join(names)} state a unit of {unit:g} m, except {', '.join(plain)}; "
-                "state the unit of each in its name, or give metres"
+                "state the unit in the name of each column, or give all positions in metres"
             )
         if rx.position == "geographic":
             raise InputError(
-                f"{self.links}: heights are not in metres ({', '.join(names)}); give them in metres"
+                f"{self.links}: heights are not in metres ({', '.join(names)}); give heights in metres"
             )
         self.section["position_unit"] = unit
-        self.assume("links.position_unit", f"{unit:g} m", f"named by the columns {', '.join(names)}")
+        self.assume("links.position_unit", f"{unit:g} m", f"stated in the column names {', '.join(names)}")
 
     def _transmitter(self, tx: PositionColumns | None, rx: PositionColumns) -> list[float | str]:
         if tx is not None:
             if tx.position != rx.position:
                 raise InputError(
                     f"{self.links}: the transmitter's position ({tx.x}, {tx.y}) and the receiver's ({rx.x}, {rx.y}) "
-                    "have different units; give both in degrees, or both in metres"
+                    "have different units; give both in degrees or both in metres"
                 )
             positions = (
                 1 if self.given.transmitters else len(self.table.frame[[tx.x, tx.y]].drop_duplicates())
@@ -449,7 +461,7 @@ class LinksDraft:
             reason = (
                 "columns of these names"
                 if self.given.transmitters is None
-                else f"of {self.given.transmitters.name}"
+                else f"columns of {self.given.transmitters.name}"
             )
             reason += (
                 "" if tx.height else f"; no height: {height:g} m{', because they move' if moves else ''}"
@@ -461,21 +473,23 @@ class LinksDraft:
         if self.given.tx is None:
             return self._transmitter_at_origin(rx)
         if rx.position == "geographic":
-            raise InputError("--tx: is in metres, but receivers are in degrees; give --transmitters, a table")
+            raise InputError(
+                "--tx is in metres, but the receivers are in degrees; give a table with --transmitters instead"
+            )
         self.assume("links.tx", ", ".join(f"{part:g}" for part in self.given.tx), "given")
         return [float(part) for part in self.given.tx]
 
     def _name_transmitters(self, tx: PositionColumns) -> None:
-        """Add the column that names the transmitters, if their positions are in the links."""
+        """Add the column of transmitter names if the table of links contains the transmitter positions."""
         if len(self.table.frame[[tx.x, tx.y]].drop_duplicates()) < 2:
             return
         name = transmitter_columns.find_transmitter_of_positions(self.table.frame, [tx.x, tx.y])
         if name is not None:
             self.section["transmitter"] = name
-            self.assume("links.transmitter", name, "each of its names has one transmitter position")
+            self.assume("links.transmitter", name, "each name has exactly one transmitter position")
 
     def _transmitter_at_origin(self, rx: PositionColumns) -> list[float | str]:
-        """Place the transmitter at the scene's origin, if the table's distances are measured from there."""
+        """Place the transmitter above the scene's origin if the distances in the table are measured from this point."""
         frame, name = self.table.frame, column_names.find_distance(self.table.frame)
         height = column_names.find_transmitter_height(frame)
         if (
@@ -488,15 +502,17 @@ class LinksDraft:
             distance = np.sqrt(frame[rx.x] ** 2 + frame[rx.y] ** 2 + (z - frame[height]) ** 2)
             if float(np.median(np.abs(distance - frame[name]))) < 0.05:
                 up = float(frame[height].iloc[0])
-                self.assume("links.tx", f"0, 0, {up:g}", f"column {name} is the distance from there")
+                self.assume(
+                    "links.tx", f"0, 0, {up:g}", f"column {name} contains the distances from this point"
+                )
                 return [0.0, 0.0, up]
         raise InputError(
-            f"{self.links}: no position of the transmitter; give --tx X,Y,Z in the scene's metres, or "
-            "--transmitters FILE"
+            f"{self.links}: no position of the transmitter; give --tx X,Y,Z [m] in the scene frame, or --transmitters "
+            "FILE"
         )
 
     def add_heights(self) -> None:
-        """Measure heights from the ground, if the ground is not at z = 0 and no height is in the scene's frame."""
+        """Measure heights from the ground if the ground is not at z = 0 and no height is in the scene frame."""
         in_scene_frame = any(
             columns is not None and columns.position == "scene" and columns.height is not None
             for columns in (self.tx, self.rx)
@@ -510,7 +526,5 @@ class LinksDraft:
             return  # a link is outside the scene, or there is no ground
         if np.abs(ground).max() > 0.5:
             self.section["heights"] = "ground"
-            reason = (
-                f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are measured from it"
-            )
+            reason = f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are relative to the ground"
             self.assume("links.heights", "ground", reason)

@@ -1,4 +1,4 @@
-"""``[facades.NAME]``: materials for parts of one mesh, by storey, side or place of an interaction, or for windows."""
+"""``[facades.NAME]``: materials for parts of one mesh, selected by storey, side or position, or for windows."""
 
 from __future__ import annotations
 
@@ -30,28 +30,32 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 0.5
-"""Largest distance of a wall from its polygon [m]: walls are on the outlines of buildings."""
+"""Largest distance of a wall from its polygon [m]; walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance from a wall at which its two sides are distinguished, and below which a point is on the wall [m]."""
+"""Distance from a wall at which its two sides are distinguished [m]. Points at smaller distances are on the wall."""
 
 
 class FacadeSection(Section):
     """``[facades.NAME]``: a separate material for those parts of walls that meet all the stated criteria.
 
     Attributes:
-        of: Material of the scene whose surfaces are divided; the new one has its constants unless ``[materials]``
-            states others.
+        of: Material of the scene with the surfaces that are divided. The new material has the same constants unless
+            ``[materials]`` states others.
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
-        facing: Compass bearings [deg] between which the outward normal of the wall lies, clockwise. The inside of a
-            wall is the side under a roof; without a roof, the order of the triangles' corners determines the inside.
-        boxes: Rectangles that contain the wall: west, south, east, north [m] in the scene's frame.
-        file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file of polygons with the wall on their outlines.
-        column: Column of the file; only polygons with the value NAME are used. If absent, all polygons.
+        facing: Compass bearings [deg] between which the outward normal of the wall lies, clockwise from the first to
+            the second. The inside of a wall is the side under a roof. Without a roof, the order of the corners of the
+            triangles determines the inside.
+        boxes: Rectangles that contain the wall: west, south, east, north [m] in the scene frame.
+        file: GeoJSON, Shapefile, GeoPackage or FlatGeobuf file of polygons; the walls are on the outlines of the
+            polygons.
+        column: Column of the file; only polygons with the value NAME in this column are used. If absent, all polygons
+            are used.
         position: "geographic" or "scene", as for ``[regions]``.
         share: Share of the wall covered by strips of this material, such as windows.
-        module: Distance between the centres of two strips [m]; rounded so that a wall has a whole number of strips.
+        module: Distance between the centres of neighbouring strips [m], rounded so that a wall has a whole number of
+            strips.
     """
 
     of: Text
@@ -71,10 +75,10 @@ class FacadeSection(Section):
             raise InputError("a facade needs a rule: storeys, facing, boxes, file or share")
         if self.storeys is not None and not 1 <= self.storeys[0] <= self.storeys[1]:
             raise InputError(
-                f"storeys = {list(self.storeys)}: must be the first and the last, counted from 1"
+                f"storeys = {list(self.storeys)}: must be the first and the last storey, counted from 1"
             )
         if self.column is not None and self.file is None:
-            raise InputError("column needs file, whose polygons it names")
+            raise InputError("column needs file: it selects polygons of the file")
         return self
 
 
@@ -84,16 +88,18 @@ def with_facade_materials(
     constants: Mapping[str, Mapping[str, object]],
     frequency: float,
 ) -> Scene:
-    """The scene with the materials of facades after its own; `constants` are stated for them in ``[materials]``.
+    """The scene with the materials of facades, for which ``[materials]`` states `constants`.
 
     Raises:
-        InputError: A facade has the name of a material, or divides a material that the scene lacks; or ITU-R P.2040 has
-            no such material at the carrier [Hz].
+        InputError: A facade has the name of a material, or divides a material that the scene lacks. ITU-R P.2040 does
+            not cover a material at the carrier [Hz].
     """
     materials, laws = dict(scene.materials), dict(scene.laws)
     for name, section in facades.items():
         if name in scene.materials:
-            raise InputError(f"[facades.{name}]: the scene has a material of this name; choose another")
+            raise InputError(
+                f"[facades.{name}]: the scene has a material with this name; choose another name"
+            )
         check_material_name(section.of, scene.materials, f"[facades.{name}] of")
         stated = dict(constants.get(name, {}))
         itu, revision = stated.pop("itu", None), str(stated.pop("revision", DEFAULT_REVISION))
@@ -113,7 +119,7 @@ def with_facade_materials(
 
 
 def without_facade_materials(scene: Scene, facades: Mapping[str, FacadeSection]) -> Scene:
-    """The scene without the materials of facades, as it is traced."""
+    """The scene without the materials of facades. Scenes are traced in this form."""
     if not facades:
         return scene
     materials, laws = (
@@ -130,9 +136,9 @@ def with_facades(
     place: Place,
     materials: Mapping[str, Material],
 ) -> Paths:
-    """The paths with the materials of facades at their interactions; if several facades apply, the first one is used.
+    """The paths with the materials of facades at the interactions. If several facades apply, the first is used.
 
-    `files` are the resolved files of the facades; `materials` are those of the scene and of the facades.
+    `files` contains the resolved paths of the facades' files. `materials` are those of the scene and of the facades.
 
     Raises:
         InputError: A file cannot be used, or there is no ground below a wall.
@@ -230,9 +236,9 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
 
 
 def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths: Paths) -> Effects:
-    """The loss of specular reflections on rough surfaces; none if no material is rough.
+    """The loss of specular reflections on rough surfaces; empty if no material is rough.
 
-    `stated` is the standard deviation of the surface heights by material [mm].
+    `stated` contains the standard deviation of the surface height of each material [mm].
     """
     names = [parameters.names[index] for index in parameters.of_effects]
     number = {

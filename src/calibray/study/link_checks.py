@@ -1,6 +1,7 @@
-"""Checks of links for common mistakes in positions, units and angles, before time is spent on tracing.
+"""Checks of links for common mistakes in positions, units and angles, made before tracing.
 
-Each finding is a suspicion with evidence, not a proof. Links are refused only if all of them are far from the scene.
+Each finding is a suspicion supported by evidence, not a proof. An error is raised only if all links are far from the
+scene.
 """
 
 from __future__ import annotations
@@ -27,35 +28,36 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Largest plausible margin of path loss below free-space loss [dB]; one ground reflection adds up to 6 dB."""
+"""Largest plausible margin of path loss below free-space loss [dB]; a ground reflection adds up to 6 dB."""
 
 GUIDED_DB: Final = 12.0
-"""The same margin under a roof [dB]: in a corridor of 40 m by 2.4 m, four reflections add up to 11 dB at 60 GHz."""
+"""The same margin under a roof [dB]. In a corridor of 40 m by 2.4 m, four reflections can add 11 dB at 60 GHz."""
 
 FAR: Final = 10.0
-"""Distance from the scene, in scene sizes, at which links cannot belong to it."""
+"""Distance from the scene, in scene sizes, beyond which links cannot belong to the scene."""
 
 CELL_SHARE: Final = 0.05
 """Largest width of averaging areas, as a share of the scene's shorter side."""
 
 HIGH: Final = 300.0
-"""Height above the whole scene [m] above which an altitude above sea level was probably read as one above ground:
-drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
+"""Height above the whole scene [m]; greater heights are probably altitudes above sea level, read as heights above
+ground. Drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
 
 DOMINATED: Final = 0.5
 """Effective share of the positions below which a few positions with many rows dominate the fit. In district 383, with
-60 rows at each of three out of about 47 positions (effectively 10 %), predictions have errors of 3.5 instead of 3.0 dB,
-and 90 % intervals cover 0.86 instead of 0.93 of the links; ten rows at every position (100 %) change neither."""
+60 rows at each of three of about 47 positions (an effective share of 10 %), prediction errors are 3.5 dB instead of 3.0
+dB, and 90 % intervals cover 86 % instead of 93 % of the links. With ten rows at every position (100 %), neither
+changes."""
 
 SPREAD: Final = 5.0
-"""Width of the cells that contain the positions of a parked GPS receiver [m]: phones are accurate to 4.9 m under an
+"""Width of the cells that contain the positions of a parked GPS receiver [m]. Phones are accurate to 4.9 m under an
 open sky (GPS.gov, GPS accuracy)."""
 
 LOSSY: Final = 0.5
-"""Mean gain [1] below which a table with a largest gain of exactly 0 dBi probably contains relative levels."""
+"""Mean gain [1] below which a table with a maximum of exactly 0 dBi probably contains relative gains."""
 
 LINKS_PER_UNKNOWN: Final = 5
-"""Smallest number of links per unknown at which a fit constrains its unknowns."""
+"""Smallest number of links per unknown that is sufficient to constrain the unknowns of a fit."""
 
 _Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _TURNS: Final[dict[str, _Turn]] = {
@@ -69,10 +71,13 @@ _TURNS: Final[dict[str, _Turn]] = {
 
 
 def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """Like `examine`; a warning if shapely is missing, and nothing if only an external program can read the scene.
+    """The findings of `examine`, or a warning that shapely is missing.
+
+    There are no findings if only an external program can read the scene.
 
     Raises:
-        InputError: All links are far from the scene, or it cannot be read, and the engine is no external program.
+        InputError: The engine is not an external program, and either all links are far from the scene or the scene
+            cannot be read.
     """
     if find_spec("shapely") is None:
         problem = "positions were not checked against the scene: shapely is not installed"
@@ -87,7 +92,7 @@ def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 
 def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """Check links for common mistakes, and return the suspicions with their remedies.
+    """Check links for common mistakes, and return the findings with their remedies.
 
     Raises:
         InputError: All links are far from the scene, the scene cannot be read, or shapely is not installed.
@@ -110,7 +115,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 
 def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """A suspicion with its remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
+    """A finding with a remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
     grouped = len(links.group_names) if links.group is not None else 1
     offsets = 0 if study.offset is None else grouped
     coefficients = sum(_count_coefficients(study, section, links) for section in study.nuisance.values())
@@ -154,7 +159,7 @@ def _clock(links: Measurements) -> Iterator[tuple[str, str]]:
     for change, number in links.prepared.items():
         if change.startswith(NOT_ON_TRACK) and change != NOT_ON_TRACK:
             yield (
-                f"{number:,} {change}: the positions of the others may be wrong",
+                f"{number:,} {change}: the positions of the other rows may be wrong",
                 "check the time zone of the table",
             )
 
@@ -170,9 +175,9 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
         within = f" within {cell:g} m" if is_geographic else ""
         average = f"{{ by = 'cell', size = {cell:g} }}" if is_geographic else "'place'"
         yield (
-            f"{count.max():,} of {len(links):,} links have the same position{within}, and each counts in fits, "
-            f"accuracy and prediction intervals: {len(count):,} positions count as about {effective:.0f} positions",
-            f"average rows of one position: links.average = {average}",
+            f"{count.max():,} of {len(links):,} links have the same position{within} and dominate fits, accuracy and "
+            f"prediction intervals: {len(count):,} positions are equivalent to about {effective:.0f} positions",
+            f"average the rows of each position: links.average = {average}",
         )
 
 
@@ -198,8 +203,8 @@ def _positions(
         touching = overhead.touching(points)
         if touching.any():
             yield (
-                f"{int(touching.sum())} of {len(points)} {name} touch the ground, a floor or a roof, whose reflections "
-                "are missed there",
+                f"{int(touching.sum())} of {len(points)} {name} touch the ground, a floor or a roof; the reflections "
+                "from this surface are missed",
                 "give the height of the antenna, at least 1 cm above the surface",
             )
     roofed = overhead.under_roof(rx)
@@ -226,20 +231,20 @@ def _positions(
     elif beyond.any():
         row = links.row[int(np.argmax(overhead.outside(links.rx)))]
         yield (
-            f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where it has no ground and no "
-            f"buildings, the first in row {row}",
-            "leave out wrong positions with links.where, or make a larger scene",
+            f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where there is no ground and there "
+            f"are no buildings; the first is in row {row}",
+            "leave out wrong positions with links.where, or create a larger scene",
         )
     if through_walls:
         return  # antennas may be indoors
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(rx)} receivers are inside buildings"
-        yield problem, "correct them, remove them, or set links.inside = 'move'"
+        yield problem, "correct or remove these receivers, or set links.inside = 'move'"
     inside = overhead.under_roof(tx) & ~overhead.underground(tx)
     if inside.any():
         problem = f"{int(inside.sum())} of {len(tx)} transmitters are inside buildings"
-        yield problem, "check position and height: an antenna on a roof is above it"
+        yield problem, "check position and height: an antenna on a roof must be above the roof"
 
 
 def refuse_far_receivers(
@@ -250,8 +255,8 @@ def refuse_far_receivers(
     Args:
         bounds: West, south, bottom, east, north and top of the scene [6], [m].
         rx: Positions of the receivers [n, 3], [m].
-        source: The table that contains them.
-        is_geographic: Whether the table contains degrees.
+        source: The table that contains the receivers.
+        is_geographic: Whether the table contains positions in degrees.
 
     Raises:
         InputError: All receivers are farther away.
@@ -265,9 +270,9 @@ def refuse_far_receivers(
             f"{source}: all receivers are more than {furthest:.0f} m from the scene, near ({centre[0]:.0f}, "
             f"{centre[1]:.0f}) m; "
             + (
-                "check links.crs, the order of longitude and latitude, and that the scene is at this place"
+                "check links.crs, the order of longitude and latitude, and the location of the scene"
                 if is_geographic
-                else "give positions relative to the scene's origin, or state their map projection as links.crs"
+                else "give positions relative to the scene's origin, or state the map projection as links.crs"
             )
         )
 
@@ -278,7 +283,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """Changes of the axes that leave at most a quarter of the receivers misplaced, and the number that remain so."""
+    """Changes of the axes that reduce the number of misplaced receivers to at most a quarter, and this number."""
     if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -288,17 +293,18 @@ def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -
 
 
 def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
-    """Check whether column names state units that differ from the study's."""
+    """Check whether column names state units that differ from those of the study."""
     links = study.links
     unit = 1.0 if links.position == "geographic" else links.position_unit
     for name in dict.fromkeys(name for name in (*links.tx, *links.rx) if isinstance(name, str)):
         if words(name) & {*LENGTH_UNITS, "m"} and (stated := find_length_unit([name])) != unit:
             yield (
-                f"the name of column {name!r} implies a unit of {stated:g} m, but it is read in units of {unit:g} m",
+                f"the name of column {name!r} implies a unit of {stated:g} m, but the column is read in units of "
+                f"{unit:g} m",
                 # Degrees have no length, so positions on the globe have no unit to state.
                 "convert it"
                 if links.position == "geographic"
-                else "convert it, or set links.position_unit if all positions have its unit",
+                else "convert the column, or set links.position_unit if all positions have this unit",
             )
     for key in ("tx_power_dbm", "eirp_dbm"):
         name = getattr(links, key)
@@ -311,14 +317,14 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
     column_words = words(name)
     if quantity in ("path_loss", "path_gain") and column_words & {"dbm", "rsrp", "rssi", "rss"}:
         yield (
-            f"column {name!r} is named like a received power [dBm], but quantity = {quantity!r} [dB]",
+            f"column {name!r} has the name of a received power [dBm], but quantity = {quantity!r} [dB]",
             "set quantity = 'received_power' with tx_power_dbm, or 'rsrp' with [offset]",
         )
     if quantity in ("received_power", "rsrp") and column_words & {
         "loss", "pl", "pathloss", "gain", "pathgain",
     }:  # fmt: skip
         yield (
-            f"column {name!r} is named like a loss or gain [dB], but quantity = {quantity!r} [dBm]",
+            f"column {name!r} has the name of a loss or gain [dB], but quantity = {quantity!r} [dBm]",
             "set quantity = 'path_loss' or 'path_gain'",
         )
     if quantity == "rsrp" or not links.measured:
@@ -336,13 +342,15 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
     if below.mean() > 0.1:
         median = float(np.median(excess[below]))
         yield (
-            f"{int(below.sum())} of {len(links)} path losses are below free space, by a median of {median:.0f} dB",
-            "check tx_power_dbm (30 dB: watts for milliwatts), gains included in the values, scene.frequency, the sign",
+            f"{int(below.sum())} of {len(links)} path losses are below free-space loss, by {median:.0f} dB in the "
+            "median",
+            "check tx_power_dbm (30 dB: watts instead of milliwatts), gains included in the values, scene.frequency "
+            "and the sign",
         )
 
 
 def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:
-    """Check whether most measured delays belong to paths that are far longer than the scene is wide."""
+    """Check whether most measured delays belong to paths that are much longer than the scene."""
     longest = FAR * max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
     for name, section in study.observables.items():
         # Devices add unknown delays to times of flight; a bias accounts for them.
@@ -352,8 +360,8 @@ def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
         length = float(np.nanmedian(measured)) * speed_of_light if np.isfinite(measured).any() else 0.0
         if length > longest:
             yield (
-                f"the median of column {section.column!r} [{section.unit}] is the time light takes for {length:.0f} "
-                f"m, more than {FAR:g} times the size of the scene",
+                f"the median of column {section.column!r} [{section.unit}] corresponds to a path length of "
+                f"{length:.0f} m, more than {FAR:g} times the size of the scene",
                 f"check observables.{name}.unit",
             )
 
@@ -373,8 +381,8 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
         spread, spread_compass = (_spread(links, gain, own, other, angle) for angle in (yaw, compass))
         if spread_compass < 0.7 * spread:
             yield (
-                f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: their standard deviation from "
-                f"a log-distance line is {spread_compass:.1f} dB instead of {spread:.1f} dB",
+                f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: the standard deviation "
+                f"around a log-distance line is {spread_compass:.1f} dB instead of {spread:.1f} dB",
                 "yaw is measured from x (east) towards y (north); a compass bearing b is pi/2 - b",
             )
 
@@ -386,8 +394,8 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
         # A lossless antenna has a mean gain of 1, so its largest gain is above 0 dBi.
         if table.gain_dbi.max() == 0 and table.efficiency < LOSSY:
             yield (
-                f"the largest gain in {file} is 0 dBi and the mean gain is {table.efficiency:.0%}, as if gains were "
-                "relative to the main direction",
+                f"the largest gain in {file} is 0 dBi and the mean gain is {table.efficiency:.0%}, which suggests "
+                "gains relative to the main direction",
                 "give absolute gains [dBi]",
             )
     if study.links.tx_antenna is not None and study.links.tx_antenna.aim is None:
@@ -402,7 +410,7 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
 
 
 def _horizontal_gain(antenna: Antenna) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """Gain at the horizon by azimuth from the main direction [dB]; None if it is the same in all directions."""
+    """Gain at the horizon [dB] as a function of azimuth from the main direction; None if the gain is constant."""
     if antenna.pattern == "tr38901":
         # 3GPP TR 38.901, Table 7.3-1.
         return lambda azimuth: -np.minimum(12 * (np.degrees(azimuth) / 65) ** 2, 30.0)
@@ -419,7 +427,7 @@ def _spread(
     other: NDArray[np.float64],
     yaw: float,
 ) -> float:
-    """Standard deviation of path loss, without the antenna's gain, from a log-distance line [dB]."""
+    """Standard deviation of path loss around a log-distance line, with the antenna gain removed [dB]."""
     away = other - own
     azimuth = (np.arctan2(away[:, 1], away[:, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi
     # Measured losses contain the antenna's gain; adding the gain removes the dependence on azimuth.

@@ -1,4 +1,4 @@
-"""The content of a study file, and everything that follows from it without reading other files."""
+"""The content of a study file, and the quantities derived from it without reading other files."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ _NEEDED: Final = {
 
 
 class StudyModel(StudyContent, ABC):
-    """A study file that has been read; use it as `calibray.Study`."""
+    """The content of a study file; the public class is `calibray.Study`."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a study file.
 
         Raises:
-            InputError: The file does not exist, is not TOML, has an unknown key or an impossible value, or names a
-                file that does not exist; one line for each error.
+            InputError: The file does not exist, is not TOML, has an unknown key or an invalid value, or names a file
+                that does not exist. The message has one line per error.
         """
         path = as_path(path, "study")
         content = read_content(path)
@@ -62,16 +62,16 @@ class StudyModel(StudyContent, ABC):
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Self:
-        """Make a study from sections in the form of TOML; whether its files exist is not checked.
+        """Create a study from sections structured as in TOML, without checking that the named files exist.
 
         File names are relative to the folder of `path`, which need not exist.
 
         Raises:
-            InputError: A key is unknown or a value impossible; one line for each error.
+            InputError: A key is unknown or a value is invalid. The message has one line per error.
         """
         if not isinstance(content, Mapping):
             raise InputError(
-                f"{path}: is a {type_name(content)}, must be a dictionary of the sections of a study"
+                f"{path}: is a {type_name(content)}, must be a dictionary with the sections of a study"
             )
         refuse_unquoted_names(content.get("parameters"), path)
         engine, other_engines = split_engine_keys(content.get("engine", {}), str(path))
@@ -100,7 +100,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def allows_blocks(self) -> bool:
-        """Whether blocks of links can be held out in turn: each needs a calibration, too expensive without replay."""
+        """Whether blocks of links can be held out in turn, which is too expensive without replay."""
         replaced = self.engine.exports_rays and self.method.name == "auto"
         return self.engine.name == "replay" or replaced
 
@@ -111,7 +111,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def scene_source(self) -> str:
-        """The scene: the path of its file, or "sionna:NAME"."""
+        """The path of the scene file, or "sionna:NAME"."""
         return (
             self.scene.file
             if self.scene.file.startswith(BUNDLED)
@@ -125,25 +125,25 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def transmitters_path(self) -> Path | None:
-        """The table of transmitters, if there is one."""
+        """The table of transmitters; None without such a table."""
         file = self.links.transmitters
         return None if file is None else self._resolve("links.transmitters", file)
 
     @property
     def track_path(self) -> Path | None:
-        """The track, if there is one."""
+        """The track; None without a track."""
         track = self.links.track
         return None if track is None else self._resolve("links.track.file", track.file)
 
     @property
     def rays_path(self) -> Path | None:
-        """The ray table that is replayed, if there is one."""
+        """The ray table that is replayed; None without such a table."""
         file = self.engine.rays if isinstance(self.engine, ReplaySection) else None
         return None if file is None else self._resolve("engine.rays", file)
 
     @property
     def observable_paths(self) -> dict[str, Path]:
-        """The files of those observables that are computed from files, by the name of the observable."""
+        """The files of the observables that are computed from files, by name of the observable."""
         return {
             name: self._resolve(f"observables.{name}.file", section.file)
             for name, section in self.observables.items()
@@ -168,16 +168,16 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
-        """The transmit and the receive antenna with which links are traced, with resolved paths of gain tables.
+        """The transmit and receive antennas used for tracing, with resolved paths of gain tables.
 
-        If the antennas at an end differ between links, this end is traced with an isotropic vertical antenna.
+        If the antennas at an end differ between links, tracing uses an isotropic vertical antenna at this end.
         """
         mounted, (tx, rx) = self.links.mountings, self.stated_antennas.values()
         return Antenna() if "tx" in mounted else tx, Antenna() if "rx" in mounted else rx
 
     @property
     def stated_antennas(self) -> dict[str, Antenna]:
-        """The antennas of both ends, "tx" and "rx", with resolved paths of gain tables."""
+        """The antennas at both ends ("tx" and "rx"), with resolved paths of gain tables."""
         return {name: self._antenna(name, getattr(self.antennas, name)) for name in ("tx", "rx")}
 
     @property
@@ -196,7 +196,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states for the scene's materials, by name."""
+        """The constants that ``[materials]`` states for materials of the scene, by name of the material."""
         return self._stated_constants(of_facades=False)
 
     def _stated_constants(self, of_facades: bool) -> dict[str, dict[str, Any]]:
@@ -208,12 +208,12 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def facade_constants(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states for facades, by name."""
+        """The constants that ``[materials]`` states for facades, by name of the facade."""
         return self._stated_constants(of_facades=True)
 
     @property
     def roughness_mm(self) -> dict[str, float]:
-        """Standard deviation of the surface height by material [mm], where ``[materials]`` states it."""
+        """Standard deviations of the surface height [mm] that ``[materials]`` states, by name of the material."""
         stated = {name: material.roughness_mm for name, material in self.materials.items()}
         return {name: height for name, height in stated.items() if height is not None}
 
@@ -225,13 +225,13 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def uses_obstruction(self) -> bool:
-        """Whether a nuisance term uses a column computed from the scene, or has clusters of receivers as groups."""
+        """Whether a nuisance term uses a column computed from the scene or clusters of receivers."""
         by_scene = any(section.by in OBSTRUCTION for section in self.nuisance.values())
         return by_scene or self.cluster_m is not None
 
     @property
     def cluster_m(self) -> float | None:
-        """Side of the squares whose receivers form the groups of a nuisance term [m]; None without such a term."""
+        """Side length of the squares that group the receivers for a nuisance term [m]; None without such a term."""
         return next((item.cluster_m for item in self.nuisance.values() if item.cluster_m is not None), None)
 
     @property
@@ -241,7 +241,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def offset_groups(self) -> tuple[str, ...]:
-        """The columns whose labels group the offset; empty for a single offset, or without an offset."""
+        """The columns of labels that group the offset; empty for a single offset or without an offset."""
         return () if self.offset is None else self.offset.term().per
 
     @property
@@ -268,12 +268,12 @@ class StudyModel(StudyContent, ABC):
     def parameter_set(
         self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None
     ) -> Parameters:
-        """The free parameters of a scene with materials `base`, with their start values, in the order of the file.
+        """The parameters and their start values for a scene with materials `base`, in the order of the file.
 
-        Materials without a frequency law in `laws` have constant values.
+        Materials without a frequency law in `laws` are independent of frequency.
 
         Raises:
-            InputError: The scene lacks a parameter's material, or a start value is outside its bounds.
+            InputError: The scene lacks the material of a parameter, or a start value is outside the bounds.
         """
         frequency = self.scene.frequency
         try:
@@ -297,7 +297,7 @@ class StudyModel(StudyContent, ABC):
         return parameters
 
     def _effect_parameter(self, name: str, materials: Collection[str]) -> Parameter:
-        """The parameter of a region, a rough surface or an antenna; for an antenna, 0 is the stated pose."""
+        """The parameter of a region, a rough surface or an antenna. For an antenna, the value 0 is the stated pose."""
         entry = self.parameters[name]
         if name.endswith(f".{ROUGHNESS}"):
             check_material(name, materials)
@@ -313,23 +313,23 @@ class StudyModel(StudyContent, ABC):
         )
 
     def content(self) -> dict[str, Any]:
-        """The study as a dictionary with all defaults; `Study.from_content` reads it."""
+        """The study as a dictionary with all defaults, which `Study.from_content` can read."""
         content = self.model_dump(mode="json", exclude_none=True)
         # These keys belong to other engines, one of which `replace` may choose.
         content["engine"] |= self._other_engines
         return content
 
     def digest(self) -> str:
-        """Fingerprint of the study: SHA-256 of its content, independent of the layout of the file.
+        """SHA-256 digest of the content of the study, independent of the layout of the file.
 
-        The order of the parameters matters, because it is the order of a candidate's values. The content of the named
-        files is not included.
+        The order of the parameters is included, because the values of a candidate have the same order. The contents of
+        the named files are not included.
         """
         content = self.content() | {"parameters": list(self.content()["parameters"].items())}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def files(self) -> tuple[Path, ...]:
-        """The study file and the files that it names, except those of a bundled scene."""
+        """The study file and the files that it names, except the files of a bundled scene."""
         return (self._path, *(file for _, _, file in self._named_files()))
 
     def check_files(self) -> None:
@@ -379,11 +379,11 @@ class StudyModel(StudyContent, ABC):
             raise InputError(f"{self._path}: {name} = {file!r}: {error}") from None
 
     def held_out(self, links: Measurements) -> NDArray[np.bool_]:
-        """Mask of the held-out links [L]: all False without ``[holdout]``, or if links are held out in turn.
+        """Mask of the held-out links [L]. All values are False without ``[holdout]`` or if links are held out in turn.
 
         Raises:
-            InputError: The filter is malformed, names a missing column, or selects all links or none; or the links lack
-                the column of labels by which they are held out in turn.
+            InputError: The filter is malformed, names a missing column, or selects all links or none. The links lack
+                the column of labels that ``[holdout]`` names.
         """
         # A missing column raises an error here, before anything is traced.
         if self.holdout is not None and self.holdout.by not in (None, "tx", *OBSTRUCTION):
@@ -396,7 +396,7 @@ class StudyModel(StudyContent, ABC):
         """The study with another method, seed or engine; the options of a replaced method are dropped.
 
         Raises:
-            InputError: A value is impossible.
+            InputError: A value is invalid.
         """
         content = self.content()
         if method is not None and method != self.method.name:

@@ -1,4 +1,4 @@
-"""The antenna of every link, its direction and the power at its port, from a study and the columns of its links."""
+"""The antenna of every link, its direction and its port power, from a study and the columns of the links."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 
 PORT_POWER: Final = "tx_port_power_dbm"
-"""Column of the links with the power that their transmitters feed into the antenna [dBm]."""
+"""Name of the column with the power that the transmitter of a link feeds into the antenna [dBm]."""
 
 LEAST_GAIN: Final = 1e-3
-"""Smallest gain along the straight line [1]. In nulls, paths in other directions carry the power; the patterns of 3GPP
-TR 38.901 are limited to 30 dB below their largest gain."""
+"""Smallest gain along the straight line [1]. In nulls, paths in other directions carry the power. The patterns of 3GPP
+TR 38.901 are limited to 30 dB below the largest gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns that state the antenna of a link, its direction, and the names to which its parameters refer."""
+    """The columns with the antenna of a link, its direction, and the names of transmitters that parameters use."""
     columns = [name for section in study.links.mountings.values() for name in section.columns]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
@@ -41,7 +41,7 @@ def mounting_columns(study: StudyModel) -> tuple[str, ...]:
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
-    """The mounting at each end of the links ("tx", "rx") where it differs between links.
+    """The mountings at the ends of the links ("tx", "rx") where these differ between links.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -70,8 +70,8 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     single = np.array([not antenna.is_array for antenna in antennas])[index]
     if (steering[single] != 0).any():
         raise InputError(
-            f"{study.path}: links.{end}_antenna.steering_deg: the antenna is not an array; give antennas.{end} rows "
-            "and columns, or remove the key"
+            f"{study.path}: links.{end}_antenna.steering_deg: the antenna is not an array; state rows and columns in "
+            f"antennas.{end}, or remove this key"
         )
     return Mounting(antennas, index, Pose(yaw, downtilt, electrical, steering))
 
@@ -79,7 +79,8 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     """Gain of the stated antennas of both ends along the straight line of each link [L], [dBi].
 
-    The gain of an end is 0 if all its links have the same one of Sionna's patterns without a main direction.
+    The gain at an end is 0 if all links have the same antenna and this has a Sionna RT pattern without a main
+    direction.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -107,9 +108,10 @@ def pose_effects(
     parameters: Parameters,
     paths: tuple[Paths, NDArray[np.int64]],
 ) -> Effects:
-    """Effects of transmit antennas' errors on paths, if there are parameters such as "tx:CELL.azimuth".
+    """Effects on paths of pose errors of transmit antennas, if there are parameters such as "tx:CELL.azimuth".
 
-    `mountings` and `table` belong to all links; `paths` has the paths of selected links, and the indices of these.
+    `mountings` and `table` describe all links; `paths` contains the paths of selected links and the indices of these
+    links.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -130,7 +132,7 @@ def pose_effects(
 
 
 def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Parameter]) -> NDArray[np.str_]:
-    """Name of every row's transmitter [rows]; empty strings if all parameters apply to every transmitter.
+    """Name of the transmitter of every row [rows]; empty strings if all parameters apply to every transmitter.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -143,7 +145,7 @@ def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Pa
 def link_antennas(
     study: StudyModel, end: str, table: SourceTable
 ) -> tuple[tuple[Antenna, ...], NDArray[np.int64]]:
-    """The distinct antennas at one end, "tx" or "rx", and the index of every row's antenna [rows].
+    """The distinct antennas at one end ("tx" or "rx"), and the index of the antenna of every row [rows].
 
     Raises:
         InputError: The column of antennas is missing, or names an unknown antenna.
@@ -173,15 +175,15 @@ def _degrees(table: SourceTable, key: str, stated: float | str, limit: int) -> N
 
 
 def states_port_power(study: StudyModel) -> bool:
-    """Whether the power at the antenna's port is computed from columns other than the transmitted power alone."""
+    """Whether the power at the antenna port depends on an EIRP or a cable loss."""
     return study.links.eirp_dbm is not None or study.links.cable_loss_db is not None
 
 
 def port_power(study: StudyModel, table: SourceTable, optional: bool = False) -> NDArray[np.float64] | None:
-    """Power that the transmitters feed into their antennas [rows], [dBm].
+    """Power that the transmitter of each row feeds into the antenna [rows], [dBm].
 
-    It is the transmitted power minus the loss of the cable, or the EIRP minus the antenna's largest gain. With
-    `optional`, a missing column gives None.
+    The power is the transmitted power minus the cable loss, or the EIRP minus the largest gain of the antenna. With
+    `optional`, the result is None if a column is missing.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -199,28 +201,29 @@ def port_power(study: StudyModel, table: SourceTable, optional: bool = False) ->
 
 
 def largest_gain_dbi(antenna: Antenna) -> float:
-    """Largest gain of an antenna over all directions on a grid of one degree [dBi]."""
+    """Largest gain of an antenna on a one-degree grid of all directions [dBi]."""
     zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
     # The amplitude of an array can be negative in side lobes.
     return float(20 * np.log10(np.abs(AntennaPattern.of(antenna).amplitude(zenith, azimuth)).max()))
 
 
 FIRST_SPREAD: Final = 0.25
-"""Initial value of an estimated spread, as a share of the width of the bounds; a uniform distribution has 0.29."""
+"""Initial value of an estimated spread, as a share of the width of the bounds. For a uniform distribution, this share
+is 0.29."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:
-    """The fields of transmitters whose spread is estimated."""
+    """The fields of transmitters with an estimated spread."""
     return tuple(
         name.rpartition(".")[2] for name, entry in study.parameters.items() if entry.spread == "auto"
     )
 
 
 def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
-    """The content of a study with one parameter per transmitter for each `spread`.
+    """The content of a study with one parameter per transmitter for each parameter that has a `spread`.
 
-    A further parameter represents transmitters without measured links. No link narrows its prior, which describes the
-    population.
+    A further parameter represents transmitters without measured links. Its prior describes the population; no link
+    narrows this prior.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -240,7 +243,7 @@ def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
 
 
 def with_spreads(study: StudyModel, spreads: Mapping[str, float]) -> dict[str, Any]:
-    """The content of a study with standard deviations of the transmitters' values by field."""
+    """The content of a study with new standard deviations, by field, in the priors of the transmitters."""
     content = study.content()
     for name, entry in content["parameters"].items():
         field = name.rpartition(".")[2]

@@ -20,35 +20,38 @@ UNITS: Final = {
     "dB": {"dB": 1.0},
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
 }
-"""Units in which values of each dimension may be given, with their values in SI units."""
+"""Accepted units of each dimension, with their values in SI units."""
 
 Positive = Annotated[float, Field(gt=0)]
 
 
 class ObservableSection(Section):
-    """``[observables.NAME]``: a statistic of the paths of each link, measured in addition to its path loss.
+    """``[observables.NAME]``: a statistic of the paths of each link, measured in addition to path loss.
 
     Attributes:
-        kind: What was measured.
-        column: Column of the measured values; links without a value lack this observable.
-        columns: Columns of the bins of a profile, in place of `column`.
-        file: Measured multipath or impulse responses, from which the values are computed, in place of columns.
-        id: Column of the links' labels, also in a multipath table.
-        where: Row filter that selects the links with this observable; all links if absent.
-        compass: Whether azimuths in the file are bearings, clockwise from north.
+        kind: The measured quantity.
+        column: Column of the measured values; links without a value do not have this observable.
+        columns: Columns of the bins of a profile, instead of `column`.
+        file: File of measured multipath components or impulse responses from which the values are computed, instead of
+            columns.
+        id: Column of link labels, in the table of links and in a multipath table.
+        where: Row filter that selects the links with this observable; if absent, all links have this observable.
+        compass: Whether azimuths in the file are compass bearings, clockwise from north.
         sample_rate: Sample rate of impulse responses without delays [Hz].
-        margin_db: Level above the noise from which a sample of an impulse response is used [dB].
-        unit: Unit of the values: "s", "ms", "us" or "ns"; "dB"; "rad" or "deg".
-        std: Standard deviation of a value's error, in the unit; estimated if absent.
-        bias: "all" for one unknown bias of all values, or a column of labels for one bias per label; none if absent.
-        path: Path of a time of flight: "mean" of all paths, "first" or "strongest".
-        dynamic_range_db: Range below the strongest path in which the receiver detects paths [dB]; all paths if absent.
+        margin_db: Level above the noise at which samples of an impulse response are used [dB].
+        unit: Unit of the values: "s", "ms", "us", "ns", "ps" or "m" for times ("m" is the distance travelled at the
+            speed of light), "dB" for levels, "rad" or "deg" for angles.
+        std: Standard deviation of the error of a value, in `unit`; estimated if absent.
+        bias: "all" for an unknown bias common to all values, or a column of labels for one bias per label. If absent,
+            there is no bias.
+        path: Path that determines a time of flight: "mean" (the mean over all paths), "first" or "strongest".
+        dynamic_range_db: Range below the strongest path in which the receiver detects paths [dB]; if absent, the
+            receiver detects all paths.
         floor_db: Path gain below which the receiver detects no paths [dB]; no limit if absent.
         window: Longest delay after the first path [s]; no limit if absent.
         bandwidth: Bandwidth of the receiver [Hz]; if absent, the receiver resolves all paths.
-        edges: Edges of the bins of a power delay profile, one more than the number of bins: delays after the first
-            path [s].
-        edges_deg: Edges of angular sectors: azimuths, counter-clockwise from the x axis [deg].
+        edges: Edges of the bins of a power delay profile, as delays after the first path [s]. N bins have N + 1 edges.
+        edges_deg: Edges of angular sectors, as azimuths counter-clockwise from the x axis [deg].
     """
 
     kind: Literal[
@@ -91,11 +94,11 @@ class ObservableSection(Section):
             raise InputError(f"unit = {self.unit!r}: a {self.kind} must be given in {' or '.join(allowed)}")
         if self.path != "mean" and self.kind not in FLIGHTS:
             raise InputError(
-                f"path = {self.path!r}: only for a time of flight or a round-trip time; remove it"
+                f"path = {self.path!r}: applies only to a time of flight or a round-trip time; remove the key"
             )
         if (self.column is not None) + bool(self.columns) + (self.file is not None) != 1:
             raise InputError(
-                "give exactly one of column, the measured values; columns, one for each bin; and file"
+                "give exactly one of column (of the measured values), columns (one for each bin) and file"
             )
         self._check_bins()
         return self
@@ -108,20 +111,20 @@ class ObservableSection(Section):
         for key, wanted in needed.items():
             if bool(getattr(self, key)) != wanted:
                 raise InputError(
-                    f"{key}: a {self.kind} {'needs' if wanted else 'takes no'} {key}, the ends of its bins"
+                    f"{key}: a {self.kind} {'needs' if wanted else 'has no'} {key}, the edges of bins"
                 )
         edges = np.array(self.edges or self.edges_deg)
         bins = len(edges) - 1 if self.file is not None else max(len(self.columns), 1)
         if self.kind not in PROFILES:
             if len(self.columns) > 1:
-                raise InputError(f"columns: a {self.kind} has one column; name it with column")
+                raise InputError(f"columns: a {self.kind} has a single column; use the key column instead")
             return
         if len(edges) != bins + 1 or bins < 1 or not (np.diff(edges) > 0).all():
             raise InputError(
-                f"edges: {max(bins, 1)} bin(s) need {max(bins, 1) + 1} increasing ends, not {edges.tolist()}"
+                f"edges: {max(bins, 1)} bin(s) need {max(bins, 1) + 1} increasing edges, not {edges.tolist()}"
             )
         if self.kind in SECTORS and edges[-1] - edges[0] > 360:
-            raise InputError(f"edges_deg: span {edges[-1] - edges[0]:g} degrees, must span 360 or fewer")
+            raise InputError(f"edges_deg: span {edges[-1] - edges[0]:g} degrees, must span at most 360")
 
     @property
     def scale(self) -> float:
@@ -140,12 +143,12 @@ class ObservableSection(Section):
         )
 
     def wanted(self, name: str) -> Wanted:
-        """The request to an external program."""
+        """The request for this observable to an external program."""
         return Wanted(name, self.statistic, self.unit, self.scale)
 
 
 def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, ObservableSection]:
-    """The sections, with each section of several columns split into one per column, named NAME_1, NAME_2, ...
+    """The sections. A section with several bins is split into one section per bin, named NAME_1, NAME_2, ...
 
     Raises:
         InputError: Two sections have the same name.
@@ -168,6 +171,6 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
                 for number, column in enumerate(columns, start=1)
             }  # fmt: skip
         if double := sorted(set(parts) & set(split)):
-            raise InputError(f"observables: {double[0]!r} is also the name of a bin; choose another")
+            raise InputError(f"observables: {double[0]!r} is also the name of a bin; choose another name")
         split |= parts
     return split

@@ -1,4 +1,4 @@
-"""``[regions.NAME]``: regions of extra loss, such as trees, and their effect on the paths of a study."""
+"""``[regions.NAME]``: regions with extra loss, such as trees, and the effect of these regions on paths."""
 
 from __future__ import annotations
 
@@ -33,41 +33,42 @@ PREFIX: Final = "region:"
 """Prefix of the names of a region's parameters."""
 
 WOODLAND: Final = (1.15, 0.43)
-"""A_1 [dB] and alpha of the maximum loss A_1 f^alpha in woodland, f in MHz (ITU-R P.833-10, section 2, Mulhouse)."""
+"""A_1 [dB] and alpha of the maximum loss A_1 f^alpha in woodland, with f in MHz (ITU-R P.833-10, section 2,
+Mulhouse)."""
 
 EXPONENT: Final = 0.284
-"""Frequency exponent of the specific attenuation: Weissberger 1982, 0.45 f^0.284 dB/m for paths of up to 14 m in dense,
-dry, in-leaf trees, with f in GHz from 0.23 to 95."""
+"""Frequency exponent of the specific attenuation: Weissberger 1982, 0.45 f^0.284 dB/m for up to 14 m of dense, dry,
+in-leaf trees, with f from 0.23 to 95 GHz."""
 
 MOST_CELLS: Final = 400
-"""Largest number of cells along either side of the ground's grid; 160,000 heights take a second."""
+"""Largest number of cells along each side of the grid of ground heights; computing 160,000 heights takes a second."""
 
 Height = float | str
 
 
 def dense_trees(frequency: float) -> float:
-    """Specific attenuation of dense trees in leaf at a carrier [Hz], [dB/m]: Weissberger 1982, as for `EXPONENT`."""
+    """Specific attenuation of dense trees in leaf at a carrier [Hz], [dB/m] (Weissberger 1982; see `EXPONENT`)."""
     return 0.45 * (frequency / 1e9) ** EXPONENT
 
 
 class RegionSection(Section):
-    """``[regions.NAME]``: polygons with extra loss along the path of a ray inside them.
+    """``[regions.NAME]``: polygons in which paths have an extra loss.
 
     Attributes:
-        file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file with the polygons, relative to the study file.
-        canopy: GeoTIFF with the height of the trees above the ground, in place of polygons.
-        boxes: Rectangles in place of a file: west, south, east, north [m] in the scene's frame.
-        position: "geographic" if the file's coordinates are in its reference system, "scene" if they are metres in the
-            scene's frame.
-        heights: "ground" for heights above the scene's ground, which the region follows (always for a canopy); if
-            absent, heights are above z = 0 of the scene.
-        bottom: Height at which the region begins [m], a number or a column of the file, in metres or the unit in the
-            column's name.
-        top: Height at which the region ends, in the same form; a canopy defines it.
-        specific_attenuation: Loss per unit length of a short path inside, at the study's carrier [dB/m]; the start
-            value if it is a parameter.
+        file: GeoJSON, Shapefile, GeoPackage or FlatGeobuf file with the polygons, relative to the study file's folder.
+        canopy: GeoTIFF with the height of the trees above the ground, instead of polygons.
+        boxes: Rectangles instead of a file: west, south, east, north [m] in the scene frame.
+        position: "geographic" if the coordinates are in the reference system that the file states, "scene" if they are
+            in the scene frame [m].
+        heights: "ground" for heights above the ground of the scene, as always for a canopy. If absent, heights are
+            above z = 0 of the scene.
+        bottom: Height of the bottom of the region: a number [m], or a column of the file, in metres or in the unit that
+            the column name states.
+        top: Height of the top of the region, in the same form; not allowed with a canopy.
+        specific_attenuation: Loss per unit length of a short path inside the region, at the study's carrier [dB/m]; the
+            start value if this is a parameter.
         frequency_exponent: Frequency exponent [1] of the specific attenuation, for links at other carriers.
-        maximum_db: Loss of a very long path inside [dB]; if absent, the value for woodland in ITU-R P.833.
+        maximum_db: Loss of a very long path inside the region [dB]; if absent, the value for woodland of ITU-R P.833.
     """
 
     file: Text | None = None
@@ -84,20 +85,20 @@ class RegionSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if sum((self.file is not None, self.canopy is not None, bool(self.boxes))) != 1:
-            raise InputError("a region is defined by a file, a canopy or boxes: give exactly one of them")
+            raise InputError("a region is defined by a file, a canopy or boxes; give exactly one of these")
         for box in self.boxes:
             west, south, east, north = box
             if not (west < east and south < north):
                 raise InputError(
-                    f"boxes: {list(box)}: must be west, south, east, north [m], west less than east and south less "
-                    "than north"
+                    f"boxes: {list(box)}: must be west, south, east, north [m], with west less than east and south "
+                    "less than north"
                 )
         if (self.top is None) != (self.canopy is not None):
             raise InputError(
-                "a region of polygons or boxes needs top [m]; a canopy defines it: remove top there"
+                "a region of polygons or boxes needs top [m], and a region with a canopy must not have top"
             )
         if self.file is None and (isinstance(self.bottom, str) or isinstance(self.top, str)):
-            raise InputError("bottom and top must be numbers [m]; columns need a file")
+            raise InputError("bottom and top must be numbers [m]; column names need a file")
         if isinstance(self.bottom, float) and isinstance(self.top, float) and not self.bottom < self.top:
             raise InputError(f"bottom = {self.bottom:g}: must be less than top = {self.top:g} [m]")
         return self
@@ -109,16 +110,16 @@ class RegionSection(Section):
         return next(((key, name) for key, name in stated if name is not None), None)
 
     def largest_loss_db(self, frequency: float) -> float:
-        """Loss of a very long path inside at a carrier [Hz], [dB]."""
+        """Loss of a very long path inside the region at a carrier [Hz], [dB]."""
         scale, exponent = WOODLAND
         return scale * (frequency / 1e6) ** exponent if self.maximum_db is None else self.maximum_db
 
     def region(self, path: Path | None, place: Place) -> Region:
-        """The region in the scene's frame, from its resolved file or boxes.
+        """The region in the scene frame, from its boxes or from the file with the resolved `path`.
 
         Raises:
-            InputError: The file cannot be read or contains no polygon, a height is not a number, or the scene's
-                position on the globe is unknown.
+            InputError: The file cannot be read or contains no polygon, a height is not a number, or the scene is not
+                georeferenced.
         """
         shapely = library("shapely", "scenes")
         columns: dict[str, NDArray] = {}
@@ -152,8 +153,8 @@ class RegionSection(Section):
         ground = surfaces.lowest_surface(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
         if (missing := inside[np.isinf(ground)]).size:
             raise InputError(
-                f"{path or 'boxes'}: the scene has no ground below polygon {missing[0] + 1}; remove it, or give "
-                "heights above z = 0, without heights = 'ground'"
+                f"{path or 'boxes'}: the scene has no ground below polygon {missing[0] + 1}; remove the polygon, or "
+                "give heights above z = 0 and remove heights = 'ground'"
             )
         terrain = _terrain(surfaces)
         if np.ptp(terrain.z) == 0:
@@ -162,7 +163,7 @@ class RegionSection(Section):
 
 
 def _terrain(surfaces: SceneSurfaces) -> Terrain:
-    """The ground of a scene on a grid; NaN where there is none."""
+    """The ground heights of a scene on a grid; NaN where there is no ground."""
     from calibray.scenes.authoring import Terrain
 
     low, high = surfaces.bounds[:2], surfaces.bounds[3:5]
@@ -173,12 +174,12 @@ def _terrain(surfaces: SceneSurfaces) -> Terrain:
 
 
 def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArray[Any], dict[str, NDArray]]:
-    """Polygons of a vector file in the scene's frame [n], and the columns of its table.
+    """Polygons of a vector file [n] in the scene frame, and the columns of the attribute table.
 
-    `position` is "geographic" if the file's coordinates are in its reference system, "scene" for the scene's frame.
+    `position` is "geographic" for coordinates in the reference system of the file, "scene" for the scene frame.
 
     Raises:
-        InputError: The file cannot be read or contains no polygon, or the scene's position on the globe is unknown.
+        InputError: The file cannot be read or contains no polygon, or the scene is not georeferenced.
     """
     shapely = library("shapely", "scenes")
     from calibray.scenes.authoring.footprints import project
@@ -188,7 +189,7 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
     # Polygons and multipolygons.
     polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
     if not polygon.any():
-        raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")
+        raise InputError(f"{path}: none of the {len(polygon)} features is a polygon; give a file of outlines")
     outline = shapely.make_valid(features.outline[polygon])
     if position == "geographic":
         known = _known(frame, path)
@@ -196,7 +197,7 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
             outline = project(outline, known, features.crs or WGS84)
         except InputError as error:
             raise InputError(
-                f"{path}: {error}, or set position = 'scene' if they are in its metres"
+                f"{path}: {error}, or set position = 'scene' if the coordinates are in the scene frame"
             ) from None
     return outline, {name: values[polygon] for name, values in features.columns.items()}
 
@@ -204,15 +205,14 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
 def _known(frame: Frame | None, path: Path) -> Frame:
     if frame is None:
         raise InputError(
-            f"{path}: the position of the scene on the globe is unknown; give [scene] origin or crs, or position = "
-            f"'scene'"
+            f"{path}: the scene is not georeferenced; give scene.origin or scene.crs, or set position = 'scene'"
         )
     return frame
 
 
 @dataclass(frozen=True)
 class Place:
-    """The data of a scene that regions need: its position on the globe, if known, and a reader of its surfaces."""
+    """The data of a scene that regions require: its georeference, if known, and a function that reads its surfaces."""
 
     frame: Frame | None
     surfaces: Callable[[], SceneSurfaces]
@@ -249,9 +249,9 @@ def region_effects(
     *,
     displaced: bool = False,
 ) -> Effects:
-    """The extra loss of paths through regions; specific attenuations are stated at the carrier `frequency` [Hz].
+    """The extra loss of paths in regions. Specific attenuations are stated at the carrier `frequency` [Hz].
 
-    If `displaced`, paths end at displaced receivers instead of their links' receivers.
+    If `displaced`, paths end at displaced receivers instead of the receivers of the links.
     """
     # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.fields import ExtraLoss
@@ -278,7 +278,7 @@ def region_effects(
 def _segments(
     paths: Paths, displaced: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """The straight segments of all paths: index of the path [k], and both ends [k, 3], [m]."""
+    """The straight segments of all paths: index of the path [k] and both end points [k, 3], [m]."""
     number = np.arange(paths.num_paths)
     path = np.repeat(number, np.diff(paths.first) + 1)
     # A path of n interactions has n + 1 segments, so the segments of path p start p places after its interactions.

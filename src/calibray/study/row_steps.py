@@ -44,13 +44,13 @@ def study_links(study: StudyModel) -> Measurements:
     """All links of a study, including held-out links.
 
     Raises:
-        InputError: The table cannot be used, or the scene's position on the globe is unknown.
+        InputError: The table cannot be used, or the scene is not georeferenced.
     """
     return measured_links(read_table(study.links_path), link_columns(study), row_steps(study))
 
 
 def link_columns(study: StudyModel) -> LinkColumns:
-    """The columns of a study's table of links, including the offset's group columns.
+    """The columns of the table of links, including the columns that group the offset.
 
     Raises:
         InputError: Keys of ``[links]`` contradict each other.
@@ -62,10 +62,10 @@ def link_columns(study: StudyModel) -> LinkColumns:
 
 
 def row_steps(study: StudyModel) -> Preparation:
-    """The steps from rows to links, as a study states them.
+    """The steps that convert rows to links, as stated in a study.
 
     Raises:
-        InputError: The scene's position on the globe is unknown, or the scene cannot be read.
+        InputError: The scene is not georeferenced or cannot be read.
     """
     links = study.links
     inside = None if links.inside == "keep" else links.inside
@@ -98,9 +98,12 @@ def row_steps(study: StudyModel) -> Preparation:
 
 
 def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> NDArray[Any]:
-    """Labels [rows] of the parts of a table that are held out separately; 0 for all rows if links determine the parts.
+    """Labels [rows] of the parts of a table that are held out separately.
 
-    Links, after averaging and merging, determine parts that depend on the measured value or on columns of averages.
+    All labels are 0 if the parts depend on the links.
+
+    Parts that depend on the measured value or on columns of averages are determined from the links, after averaging and
+    merging.
     """
     table, none = replace(table, frame=table.frame.drop(columns=value, errors="ignore")), np.zeros(len(table))
     if holdout.by is not None:
@@ -112,13 +115,13 @@ def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> 
 
 
 def row_track(study: StudyModel) -> Track | None:
-    """The track that gives rows their positions, or None."""
+    """The track that contains the positions of rows, or None."""
     track = study.links.track
     return None if track is None else Track(str(study.track_path), track.time, track.longest_gap, track.clock)
 
 
 def position_steps(study: StudyModel) -> Preparation:
-    """The steps that position the antennas of rows; they keep all rows.
+    """The steps that determine the positions of the antennas of rows. No row is removed.
 
     Raises:
         InputError: As for `row_steps`.
@@ -149,22 +152,22 @@ def _move_outside(study: StudyModel) -> MoveOutside:
 
 
 def scene_frame(study: StudyModel) -> Frame:
-    """The position of a study's scene on the globe, stated by the study or otherwise by the scene file.
+    """The georeference of the scene, as stated in the study or else in the scene file.
 
     Raises:
-        InputError: Neither states it, or the projection is unknown.
+        InputError: Neither file states a georeference, or the projection is unknown.
     """
     frame = known_frame(study)
     if frame is None:
         raise InputError(
-            f"{study.path}: links.position = 'geographic': the scene's position on the globe is unknown; give "
-            f"scene.origin = [longitude, latitude], and scene.crs if the scene is in a map projection"
+            f"{study.path}: links.position = 'geographic': the scene is not georeferenced; give scene.origin = "
+            "[longitude, latitude], and scene.crs if the scene is in a map projection"
         )
     return frame
 
 
 def known_frame(study: StudyModel) -> Frame | None:
-    """The position of a study's scene on the globe; None if neither the study nor the scene file states it.
+    """The georeference of the scene; None if neither the study nor the scene file states one.
 
     Raises:
         InputError: The projection is unknown.
@@ -184,10 +187,10 @@ def known_frame(study: StudyModel) -> Frame | None:
 
 
 def study_regions(study: StudyModel) -> dict[str, Region]:
-    """The regions of a study by name.
+    """The regions of a study, by name.
 
     Raises:
-        InputError: A file cannot be read, or the scene's position on the globe is unknown.
+        InputError: A file cannot be read, or the scene is not georeferenced.
     """
     if not study.regions:
         return {}
@@ -203,7 +206,7 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
 
 
 def scene_place(study: StudyModel) -> Place:
-    """The data of a scene that regions and facades need."""
+    """The data of the scene that regions and facades require."""
     return Place(known_frame(study), partial(_surfaces, study.scene_source))
 
 

@@ -1,4 +1,4 @@
-"""The sections of a study file that state the scene, the links and the antennas; unknown keys are errors."""
+"""The sections of a study file for the scene, the links and the antennas. Unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ class SceneSection(Section):
     Attributes:
         file: Mitsuba XML file, relative to the study file's folder, or "sionna:NAME" for a bundled scene.
         frequency: Carrier frequency [Hz].
-        bandwidth: Bandwidth [Hz], for averaging over the band.
-        origin: Longitude and latitude [deg] of the scene's origin, for geographic positions.
-        crs: Projection of the scene's x and y, for instance "EPSG:32632"; a local projection at the origin if absent.
+        bandwidth: Bandwidth over which power is averaged [Hz].
+        origin: Longitude and latitude [deg] of the origin of the scene, for geographic positions.
+        crs: Projection of the x and y coordinates of the scene, for instance "EPSG:32632"; if absent, a local
+            projection at the origin.
     """
 
     file: Text
@@ -48,21 +49,22 @@ class SceneSection(Section):
 
 
 class MaterialSection(Section):
-    """``[materials]``, one entry: constants that replace the scene's.
+    """One entry of ``[materials]``: constants that replace those in the scene.
 
     Attributes:
-        itu: ITU-R P.2040 material that gives permittivity and conductivity.
+        itu: Name of the ITU-R P.2040 material that determines permittivity and conductivity.
         revision: Revision of ITU-R P.2040; only with `itu`.
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
-        scattering_coefficient: Scattering coefficient [1]; unlike a scene's value of 0, a stated 0 is exact.
+        scattering_coefficient: Scattering coefficient [1]. A value of 0 stated here is exact, unlike a value of 0 in
+            the scene.
         xpd_coefficient: Cross-polarization discrimination coefficient [1].
         scattering_pattern: "lambertian", "directive" or "backscattering".
         alpha_r: Exponent [1] of the lobe around the specular direction.
         alpha_i: Exponent [1] of the lobe back towards the source.
-        lambda_: Share [1] of the diffuse energy in the lobe around the specular direction.
-        roughness_mm: Standard deviation of the surface height [mm]; it weakens specular reflections.
+        lambda_: Share [1] of the diffuse power in the lobe around the specular direction.
+        roughness_mm: Standard deviation of the surface height [mm]. Roughness attenuates specular reflections.
     """
 
     itu: Text | None = None
@@ -82,7 +84,7 @@ class MaterialSection(Section):
     def _physical(self) -> Self:
         if self.revision is not None and self.itu is None:
             raise InputError(
-                f"revision = {self.revision!r} without itu; name the ITU-R material, or remove it"
+                f"revision = {self.revision!r} without itu; name the ITU-R material, or remove the revision"
             )
         stated = self.model_dump(exclude_none=True, exclude={"itu", "revision", "roughness_mm"})
         Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **stated})
@@ -90,15 +92,15 @@ class MaterialSection(Section):
 
 
 class AverageSection(Section):
-    """``[links.average]``: samples that are close together are averaged into one link, in linear power.
+    """``[links.average]``: averaging of nearby samples into one link, in linear power.
 
     Attributes:
-        by: "place" averages over equal receiver positions, "cell" over cells of a square grid, "distance" over the
-            distance travelled in the order of the rows, and "time" over time windows.
-        size: Width or length [m], or duration [s]; required except for "place".
+        by: "place" averages samples at equal receiver positions, "cell" in cells of a square grid, "distance" in
+            intervals of the distance travelled in the order of the rows, and "time" in time windows.
+        size: Width or length of an average [m], or duration [s]; required except for "place".
         time: Column of times; only for "time".
-        unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
-        minimum_count: Smallest number of samples in an average; averages of fewer samples are left out.
+        unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
+        minimum_count: Smallest number of samples in an average; averages over fewer samples are excluded.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -110,10 +112,10 @@ class AverageSection(Section):
     @model_validator(mode="after")
     def _sized_or_timed(self) -> Self:
         if (self.by == "place") != (self.size is None):
-            remedy = "takes no size; remove it" if self.by == "place" else "needs size, in m or s"
+            remedy = "has no size; remove the key" if self.by == "place" else "needs size, in m or s"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         if (self.by == "time") != (self.time is not None):
-            remedy = "needs time, the column of times" if self.by == "time" else "takes no time; remove it"
+            remedy = "needs time, the column of times" if self.by == "time" else "has no time; remove the key"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         return self
 
@@ -130,13 +132,13 @@ _Average = Annotated[
 
 
 class TrackSection(Section):
-    """``[links.track]``: a GPX track that gives the position of each row by its time.
+    """``[links.track]``: a GPX track from which the position of each row is interpolated at its time.
 
     Attributes:
         file: GPX file, relative to the study file's folder.
-        time: Column of the rows' times: ISO 8601, or seconds since 1970.
-        longest_gap: Longest time between two track points [s]; rows in a longer gap are left out.
-        clock: Time by which the table's clock is ahead of the track's clock [s].
+        time: Column with the times of the rows, in ISO 8601 or as seconds since 1970.
+        longest_gap: Longest time between two track points [s]; rows in longer gaps are excluded.
+        clock: Time by which the clock of the table is ahead of the clock of the track [s].
     """
 
     file: Text
@@ -146,19 +148,19 @@ class TrackSection(Section):
 
 
 class MountingSection(Section):
-    """``[links.tx_antenna]`` or ``[links.rx_antenna]``: the antenna of each link at this end, and its direction.
+    """``[links.tx_antenna]`` or ``[links.rx_antenna]``: type and direction of the antenna of each link at this end.
 
     Attributes:
-        type: Column with names from ``[antennas.types]``; if absent, all links have the antenna of ``[antennas]``.
-        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It rotates the antenna in
-            addition to the antenna's own orientation.
+        type: Column with names from ``[antennas.types]``. If absent, all links have the antenna of ``[antennas]``.
+        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. The antenna is rotated by this angle in
+            addition to its orientation in ``[antennas]``.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
-        electrical_downtilt_deg: Downward shift of the pattern in the antenna's frame, or of an array's beam [deg], a
-            number or a column.
-        steering_deg: Direction to which an array's beam is steered electrically, relative to the antenna [deg], a
-            number or a column; clockwise if azimuths are compass bearings.
-        aim: "other end" points every antenna at the other end of its link, in place of azimuth and downtilt.
+        electrical_downtilt_deg: Downward shift of the pattern in the frame of the antenna, or of the beam of an array
+            [deg]; a number or a column.
+        steering_deg: Azimuth to which the beam of an array is steered electrically, relative to the antenna [deg]; a
+            number or a column. This azimuth is clockwise if azimuths are compass bearings.
+        aim: "other end" points every antenna at the other end of its link, instead of azimuth and downtilt.
     """
 
     type: Text | None = None
@@ -173,13 +175,13 @@ class MountingSection(Section):
     def _one_direction(self) -> Self:
         if self.aim is not None and (self.azimuth_deg is not None or self.downtilt_deg != 0):
             raise InputError(
-                "aim = 'other end' gives azimuth and downtilt; remove azimuth_deg and downtilt_deg"
+                "aim = 'other end' determines azimuth and downtilt; remove azimuth_deg and downtilt_deg"
             )
         return self
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of the links that this section names."""
+        """The columns of the table of links that this section names."""
         stated = (
             self.type,
             self.azimuth_deg,
@@ -191,41 +193,44 @@ class MountingSection(Section):
 
 
 class LinksSection(Section):
-    """``[links]``: the table of measured links, and how its rows become links.
+    """``[links]``: the table of measured links, and the conversion of its rows to links.
 
     Attributes:
         file: CSV, Parquet or Excel file, relative to the study file's folder.
-        tx: Transmitter position (x, y, z) [m], each a number or a column; longitude, latitude [deg] and height [m]
-            if positions are "geographic".
+        tx: Transmitter position (x, y, z) [m], or longitude, latitude [deg] and height [m] if `position` is
+            "geographic". Each coordinate is a number or a column.
         rx: Receiver position, in the same form.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power with
-            unknown transmitted power.
-        position: "scene" for metres in the scene's frame, "geographic" for longitude and latitude.
-        crs: Reference system of positions that are "geographic", such as EPSG:32632; longitude and latitude if absent.
-        position_unit: Unit of the position columns in the scene's frame [m].
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for a received power with
+            an unknown transmitted power.
+        position: "scene" for metres in the scene frame, "geographic" for longitude and latitude or for coordinates in
+            `crs`.
+        crs: Reference system of "geographic" positions, such as EPSG:32632; longitude and latitude if absent.
+        position_unit: Unit of the position columns in the scene frame [m].
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
-        tx_power_dbm: Transmitted power [dBm], a number or a column; needed with a received power.
-        eirp_dbm: Radiated power [dBm] in the main direction, in place of the transmitted power.
-        cable_loss_db: Loss between transmitter and antenna [dB], a number or a column; needs a transmitted power.
-        tx_antenna: Antennas of the transmitters, if they differ.
-        rx_antenna: Antennas of the receivers, if they differ.
-        device: Column of the names of receiving devices, which parameters such as "rx:PHONE.dx" displace.
+        tx_power_dbm: Transmitted power [dBm], a number or a column; required for received powers.
+        eirp_dbm: Radiated power in the main direction (EIRP) [dBm], instead of the transmitted power.
+        cable_loss_db: Loss between transmitter and antenna [dB], a number or a column; requires a transmitted power.
+        tx_antenna: Antennas of the transmitters, if these differ between links.
+        rx_antenna: Antennas of the receivers, if these differ between links.
+        device: Column with the names of receiving devices, for parameters such as "rx:PHONE.dx" that displace these
+            devices.
         position_error_m: Standard deviation of receiver position errors along x and y [m], a number or a column.
-        frequency: Column of carrier frequencies, in Hz or the unit in its name; if absent, all links have the scene's
-            carrier.
-        wide: Name of the transmitter by column, for a table with one column per transmitter.
-        track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
-        heights: "ground" for heights above the scene's ground; above the datum of the scene's frame if absent.
+        frequency: Column of carrier frequencies, in Hz or in the unit that its name states. If absent, all links have
+            the carrier of ``[scene]``.
+        wide: Names of the transmitters by column, for a table with one column per transmitter.
+        track: GPX track from which the columns `track_longitude` and `track_latitude` [deg] are added to the rows.
+        heights: "ground" for heights above the ground of the scene. If absent, heights are above z = 0 of the scene
+            frame.
         transmitters: Table with one row per transmitter, relative to the study file's folder.
-        transmitter: Column of both tables with the name of the transmitter.
-        missing: Numbers that mean that nothing was measured, in addition to common codes such as 100 or -999.
-        noise_floor_dbm: Noise floor [dBm]; a missing received power counts as below it.
-        below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, and "censor" keeps
-            them as upper bounds of the received power, which the intervals account for.
-        inside: How receivers inside buildings are treated: "keep", "drop", or "move" to the nearest street.
+        transmitter: Column with the name of the transmitter, in both tables.
+        missing: Numbers that represent missing measurements, in addition to common codes such as 100 or -999.
+        noise_floor_dbm: Noise floor [dBm]. A missing received power is treated as below the noise floor.
+        below_floor: Treatment of rows at or below the noise floor: "exclude" removes these rows, and "censor" keeps the
+            rows as upper bounds of the received power, which the intervals account for.
+        inside: Treatment of receivers inside buildings: "keep", "drop", or "move" to the nearest street.
         average: How samples are averaged.
     """
 
@@ -263,40 +268,42 @@ class LinksSection(Section):
     def _consistent(self) -> Self:
         if self.position == "geographic" and self.position_unit != 1:
             raise InputError(
-                f"links.position_unit = {self.position_unit:g} with position = 'geographic': degrees have no length; "
-                f"remove it"
+                f"links.position_unit = {self.position_unit:g} with position = 'geographic': degrees are not a unit of "
+                "length; remove the key"
             )
         if self.crs is not None and (self.position != "geographic" or self.track is not None):
             raise InputError(
-                f"links.crs = {self.crs!r}: is the reference system of columns of positions on the globe; set "
-                "links.position = 'geographic', without a track"
+                f"links.crs = {self.crs!r}: is the reference system of geographic position columns; set links.position "
+                "= 'geographic', without a track"
             )
         if self.eirp_dbm is not None and (self.tx_power_dbm is not None or self.cable_loss_db is not None):
             raise InputError(
-                "links.eirp_dbm includes the transmitted power, cables and the antenna's gain; remove tx_power_dbm and "
-                "cable_loss_db"
+                "links.eirp_dbm includes the transmitted power, the cable loss and the antenna gain; remove "
+                "tx_power_dbm and cable_loss_db"
             )
         if self.cable_loss_db is not None and self.tx_power_dbm is None:
-            raise InputError("links.cable_loss_db needs tx_power_dbm [dBm], the power before the cable")
+            raise InputError(
+                "links.cable_loss_db needs tx_power_dbm [dBm], the power at the input of the cable"
+            )
         if self.noise_floor_dbm is not None and self.quantity not in ("received_power", "rsrp"):
             raise InputError(
                 f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: the noise floor "
-                "is a received power; filter losses by links.where"
+                "is a received power; filter path losses with links.where"
             )
         if self.below_floor == "censor" and self.noise_floor_dbm is None:
             raise InputError(
-                "links.below_floor = 'censor' needs noise_floor_dbm [dBm], the floor at which links are censored"
+                "links.below_floor = 'censor' needs noise_floor_dbm [dBm], below which links are censored"
             )
         if self.below_floor == "censor" and self.average is not None:
             raise InputError(
-                "links.below_floor = 'censor' with [links.average]: averages already count samples below the noise "
-                "floor at half of the floor; remove one of them"
+                "links.below_floor = 'censor' with [links.average]: averages already include samples below the noise "
+                "floor, at half of its power; remove one of these keys"
             )
         return self
 
     @property
     def mountings(self) -> dict[str, MountingSection]:
-        """The sections of the ends, "tx" and "rx", whose antennas differ between links."""
+        """The sections of the ends ("tx" and "rx") at which antennas differ between links."""
         stated = {"tx": self.tx_antenna, "rx": self.rx_antenna}
         return {end: section for end, section in stated.items() if section is not None}
 
@@ -309,7 +316,7 @@ class AntennasSection(Section):
         rx: The receive antenna.
         types: Further antennas by name, for ``links.tx_antenna.type`` and ``links.rx_antenna.type``.
         known: Whether an engine that exports rays used these antennas. By default, isotropic vertical antennas at both
-            ends, which a draft assumes, count as unknown.
+            ends (the assumption of a draft) are treated as unknown.
     """
 
     tx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]

@@ -1,4 +1,4 @@
-"""The opened study: one calibration problem with its links, scene and parameters, and the paths of its links."""
+"""The opened study: one calibration problem with its links, scene, parameters and paths."""
 
 from __future__ import annotations
 
@@ -65,16 +65,18 @@ _LOG: Final = logging.getLogger(__name__)
 @final
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """An opened study: its links, scene and parameters, each read once, and the tracer of its paths.
+    """An opened study: its links, scene and parameters, each read once, and the ray tracer.
 
     Attributes:
         study: The study.
         links: All links of the study, including the held-out links.
-        scene: Its scene with the parameters' start values, because the tracer's choice of rays depends on materials.
-        parameters: The parameters whose values a candidate contains.
+        scene: The scene with the start values of the parameters, because the rays that the tracer launches depend on
+            the materials.
+        parameters: The parameters for which a candidate contains values.
         held_out: Mask of the held-out links [L].
-        factory: Opens the scene in a ray tracer.
-        placed: Values of the parameters at which paths are traced, if any displace antennas; start values if absent.
+        factory: Function that opens the scene in a ray tracer.
+        placed: Values of the parameters at which paths are traced, if parameters displace antennas; start values if
+            absent.
         neighbours: Distances of the neighbouring positions that are traced, as shares of the largest displacement.
     """
 
@@ -95,8 +97,8 @@ class Setup:
 
         Args:
             study: The study.
-            tracer: Opens the scene in a ray tracer.
-            links: Links that replace the study's; none of them is held out.
+            tracer: Function that opens the scene in a ray tracer.
+            links: Links that replace those of the study; none of these links is held out.
 
         Raises:
             InputError: The links, the scene, the parameters or the hold-out cannot be used.
@@ -126,19 +128,19 @@ class Setup:
         return setup.with_obstruction() if study.uses_obstruction else setup
 
     def opened(self) -> Setup:
-        """This setup; the method lets functions accept both a study and an opened study."""
+        """The setup itself, so that functions can accept both studies and opened studies."""
         return self
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
-        """The setup with another method, seed or engine; no file is read again (see `Study.replace`).
+        """The setup with another method, seed or engine (see `Study.replace`); no file is read again.
 
         Raises:
-            InputError: A value is impossible.
+            InputError: A value is invalid.
         """
         return self._with_tracer(replace(self, study=self.study.replace(method, seed, engine)))
 
     def at(self, links: Measurements) -> Setup:
-        """The setup with other links, none of them held out; no file is read again."""
+        """The setup with other links, none of which is held out; no file is read again."""
         setup = self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
         return setup.with_obstruction() if self.study.uses_obstruction else setup
 
@@ -147,7 +149,7 @@ class Setup:
         return self._with_tracer(replace(self, parameters=parameters))
 
     def with_obstruction(self) -> Setup:
-        """The setup with the links' columns that are computed from the scene (`obstruction.COLUMNS`)."""
+        """The setup with links that have the columns computed from the scene (`obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
             self.links,
@@ -160,9 +162,9 @@ class Setup:
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on paths other than those of material constants: antenna errors, regions, and rough surfaces.
+        """Effects on paths that are not due to material constants, such as antenna errors and losses in regions.
 
-        `links` are the indices of the paths' links among all links; all links if None.
+        `links` contains the indices of the paths' links among all links; if None, the paths belong to all links.
         """
         effects = self._pose_and_region_effects(paths, links)
         return effects + self._displacement_effects(paths, effects)
@@ -173,7 +175,7 @@ class Setup:
         return poses + self._path_effects(paths)
 
     def _path_effects(self, paths: Paths) -> Effects:
-        """The effects that depend only on the path: the loss in regions and on rough surfaces."""
+        """The effects that depend only on the path: the losses in regions and on rough surfaces."""
         study, parameters, frequency = self.study, self.parameters, self.study.scene.frequency
         displaced = self._position_error_m is not None
         extra = region_effects(study.regions, self.regions, parameters, paths, frequency, displaced=displaced)
@@ -181,7 +183,7 @@ class Setup:
 
     @cached_property
     def regions(self) -> dict[str, Region]:
-        """The regions of extra loss by name."""
+        """The regions with extra loss, by name."""
         return study_regions(self.study)
 
     @cached_property
@@ -197,10 +199,11 @@ class Setup:
         return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
 
     def placed_at(self, values: Mapping[str, float], neighbours: tuple[float, ...] = ()) -> Setup:
-        """The setup, traced with antennas at the positions given by values of the parameters.
+        """The setup with paths traced at the antenna positions that `values` of the parameters determine.
 
-        It is unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on each side
-        of these positions (shares of the largest displacement); without any, it does not depend on displacements.
+        The setup is unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on
+        each side of these positions (shares of the largest displacement). Without neighbours, path loss does not depend
+        on displacements.
         """
         if not any(displaces(item.name) for item in self.parameters):
             return self
@@ -214,7 +217,7 @@ class Setup:
         return links
 
     def _displacement_effects(self, paths: Paths, others: Effects) -> Effects:
-        """The change of path loss by displacements, from traces at neighbouring positions."""
+        """The change in path loss due to displacements, from traces at neighbouring positions."""
         if not self._displacements or not self.neighbours:
             return ()
 
@@ -232,7 +235,7 @@ class Setup:
 
     @property
     def radio(self) -> RadioSettings:
-        """Carrier, bandwidth, way of combining paths, and antennas."""
+        """Carrier, bandwidth, combining of paths, antennas and observables."""
         study = self.study
         wanted = tuple(section.wanted(name) for name, section in study.observables.items())
         return RadioSettings(
@@ -245,9 +248,9 @@ class Setup:
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antenna of an engine that exports rays; None if the study does not state them.
+        """Transmit and receive antennas of an engine that exports rays; None if not stated in the study.
 
-        The result is also None if antennas differ between links.
+        The result is also None if the antennas differ between links.
         """
         section = self.study.antennas
         known = section != AntennasSection() if section.known is None else section.known
@@ -270,7 +273,7 @@ class Setup:
 
     @property
     def tracer_versions(self) -> Mapping[str, str]:
-        """Versions of the ray tracer's parts by name."""
+        """Versions of the components of the ray tracer, by name."""
         return self.factory.versions
 
     @property
@@ -283,20 +286,23 @@ class Setup:
 
     @cached_property
     def _loaded(self) -> dict[str, Any]:
-        """The tracer, once it is loaded, and the digest of its files; shared by all setups of one scene."""
+        """The tracer, after it has been loaded, and the digest of its files.
+
+        All setups of one scene share this dictionary.
+        """
         return {}
 
     def _files_digest(self) -> str:
         return cache.files_digest(self.scene, self.study.antenna_pair)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for another process: without the loaded tracer, and independent of the current folder."""
+        """The state for another process, without the loaded tracer and with an absolute path of the scene."""
         state = {item.name: getattr(self, item.name) for item in fields(self)}
         return state | {"scene": replace(self.scene, path=self.scene.path.absolute())}
 
     @property
     def carriers(self) -> dict[float, dict[str, Material]]:
-        """Materials before calibration by carrier [Hz]; empty if all links have the study's carrier."""
+        """Materials before calibration, by carrier [Hz]; empty if all links have the study's carrier."""
         return self._materials_by_carrier
 
     @cached_property
@@ -313,7 +319,7 @@ class Setup:
 
     @cached_property
     def files(self) -> dict[str, str]:
-        """SHA-256 of every file of the scene and the antennas, by its resolved path."""
+        """SHA-256 digests of all files of the scene, antennas, rays, regions and facades, by path."""
         return input_digests(self.study, self.scene)
 
     def tracer_at(self, frequency: float) -> Tracer:
@@ -323,10 +329,10 @@ class Setup:
     def trace(
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
-        """The paths of the links, from the cache if they were traced before, or from the study's ray table or program.
+        """The paths of the links, which are traced, cached, or obtained from a ray table or external program.
 
-        A program that returns rays is called once. Links that differ only in their carrier are traced once.
-        `materials` replace the scene's by name; `progress` is called with "tracing" after every launch.
+        A program that returns rays is called once. Links that differ only in carrier are traced once. `materials`
+        replace those of the scene, by name. `progress` is called with "tracing" after every launch.
 
         Raises:
             InputError: The tracer cannot be used, or the scene lacks a material.
@@ -352,7 +358,7 @@ class Setup:
         )
 
     def _trace_links(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
-        """Paths of the links; if positions have errors, paths whose power is the mean over displaced receivers."""
+        """Paths of the links. If positions have errors, the power of the paths is the mean over displaced receivers."""
         errors = self._position_error_m
         if errors is None:
             return self._trace(links, scene, progress)
@@ -360,7 +366,7 @@ class Setup:
 
     @cached_property
     def _ground(self) -> Ground | None:
-        """Height of the lowest surface, +inf where there is none; None if heights are not relative to the ground."""
+        """Function for the height of the lowest surface, or +inf; None if heights are not above ground."""
         return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property
@@ -379,9 +385,9 @@ class Setup:
         return errors
 
     def with_position_noise(self) -> Setup:
-        """The setup with links weighted by the noise due to position errors; unchanged without such errors.
+        """The setup with links weighted by the noise due to position errors. Without such errors, it is the same setup.
 
-        The noise is the spread of path loss over displaced receivers at the start values.
+        The noise is the standard deviation of path loss over displaced receivers at the start values.
         """
         errors, links, study = self._position_error_m, self.links, self.study
         if errors is None:
@@ -409,7 +415,7 @@ class Setup:
 
     @cached_property
     def mountings(self) -> dict[str, Mounting]:
-        """The antennas at the ends, "tx" or "rx", if they differ between links.
+        """The antennas at the ends ("tx", "rx") where they differ between links.
 
         Raises:
             InputError: A column is missing or malformed, or names an unknown antenna.
@@ -440,7 +446,7 @@ class Setup:
         return changed
 
     def _with_tracer(self, changed: Setup) -> Setup:
-        """A changed setup with the same tracer, which depends neither on links nor on methods."""
+        """A changed setup with the same tracer, which is independent of links and methods."""
         changed.__dict__["_loaded"] = self._loaded
         known = {name: value for name, value in vars(self).items() if name in ("regions", "_ground")}
         changed.__dict__.update(known)
@@ -477,7 +483,7 @@ def _scene_of(study: StudyModel, frequency: float) -> Scene:
 
 
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
-    """The paths of the study's ray table, whose powers are valid at the start values."""
+    """The paths of the study's ray table, with powers that are valid at the start values."""
     from calibray.engines.rays.compile import RaySetting, compile_rays
     from calibray.engines.rays.table import RayTable, read_ray_file
 
@@ -486,7 +492,7 @@ def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material])
 
 
 def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
-    """The paths that the study's program returns, whose powers are valid for `materials`."""
+    """The paths that the study's program returns, with powers that are valid for `materials`."""
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})

@@ -1,4 +1,4 @@
-"""The study: one calibration problem, as stated in its file."""
+"""The study: one calibration problem, as stated in a study file."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ _LOG: Final = logging.getLogger(__name__)
 
 @final
 class Study(StudyModel):
-    """One calibration problem, as stated in its study file; see ``docs/reference/study-file.md``.
+    """One calibration problem, as stated in a study file (see ``docs/reference/study-file.md``).
 
     Attributes:
         version: Version of the file format.
         scene: The scene and the carrier.
-        objects: Materials that are created for objects, by name: a pattern of the objects' names.
-        materials: Constants that replace the scene's, by material name.
+        objects: Patterns of object names, by name of the material that is created for these objects.
+        materials: Constants that replace those of the scene, by name of the material.
         links: The measured links.
         antennas: The antennas.
         trace: Settings of the ray tracer.
-        objective: How paths are combined into a path loss.
-        parameters: The free parameters by name, in the order of a candidate's values.
-        offset: The nuisance term "offset" in its short form, or None.
+        objective: Combination of paths into a path loss, and treatment of links without a path.
+        parameters: The parameters by name, in the order of the values of a candidate.
+        offset: The nuisance term "offset" in its short form; None without an offset.
         nuisance: Further nuisance terms by name; `nuisance_terms` contains all terms.
         noise: The errors of measured links.
         holdout: The held-out links, or None.
@@ -76,16 +76,16 @@ class Study(StudyModel):
         overwrite: bool = False,
         **sections: Mapping[str, Any],
     ) -> Study:
-        """Make a study of a Sionna RT scene in memory, with its carrier, transmitters, receivers, arrays and materials.
+        """Create a study from a Sionna RT scene in memory: carrier, transmitters, receivers, arrays and materials.
 
         Args:
             scene: The `sionna.rt.Scene`.
             measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, with NaN where
-                nothing was measured; or a pandas DataFrame with names of transmitters as rows and of receivers as
-                columns. Masked values and pd.NA count as NaN.
-            folder: Folder for the scene, the links and `study.toml`, which `Study.load` reads; a temporary folder if
-                None.
-            overwrite: Replace files in the folder that Calibray did not write.
+                nothing was measured. Alternatively, a pandas DataFrame with the names of transmitters as rows and the
+                names of receivers as columns. Masked values and pd.NA are treated as NaN.
+            folder: Folder in which the scene, the links and `study.toml` are written for `Study.load`; a temporary
+                folder if None.
+            overwrite: Whether to replace files in the folder that Calibray did not write.
             **sections: Sections of the study file that replace the defaults, such as ``trace={"max_depth": 5}`` or
                 ``links={"quantity": "received_power"}``. Without `parameters`, the permittivities of all materials
                 except air and metal are calibrated.
@@ -100,7 +100,7 @@ class Study(StudyModel):
             if not isinstance(section, Mapping):
                 raise InputError(
                     f"{name}: is {shortened(repr(section))}, must be a dictionary with keys of this section of the "
-                    "study file; leave it out for the defaults"
+                    "study file; omit the argument for the defaults"
                 )
         target = mkdtemp(prefix="calibray-study-") if folder is None else folder
         target = check_outputs(target, ("links.csv", "study.toml"), overwrite=overwrite)
@@ -121,8 +121,7 @@ class Study(StudyModel):
         """All links of the study, including held-out links, with the groups of the offset.
 
         Raises:
-            InputError: The table cannot be used (see `read_measurements`), or the scene's position on the globe is
-                unknown.
+            InputError: The table cannot be used (see `read_measurements`), or the scene is not georeferenced.
         """
         return study_links(self)
 
@@ -130,12 +129,12 @@ class Study(StudyModel):
         """Links without measured values, for prediction, with the groups of the offset.
 
         Args:
-            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame, as in
-                `result-links.csv`; or rows like those of the study's table, in the same units. No row is left out, and
-                a row of a wide table is one link per transmitter.
+            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene frame, as in
+                `result-links.csv`, or rows in the form of the study's table. No row is left out, and a row of a wide
+                table becomes one link per transmitter.
 
         Returns:
-            One link per row, with carriers if the table has the study's carrier column.
+            One link per row, with carriers if the table has the carrier column of the study.
 
         Raises:
             InputError: A column is missing or malformed, or a position is not finite.
@@ -150,9 +149,10 @@ class Study(StudyModel):
             own = {*POSITION_COLUMNS} & {*links.tx, *links.rx}
             if own and links.value in columns and (links.heights is not None or links.position_unit != 1):
                 _LOG.warning(
-                    "%s: columns tx_x to rx_z are read as metres in the scene's frame, without links.heights and "
-                    "links.position_unit of the study; for a table like the study's, rename %s in both tables and in "
-                    "the study", table.source, ", ".join(sorted(own)),
+                    "%s: columns tx_x to rx_z are read as metres in the scene frame, without links.heights and "
+                    "links.position_unit of the study; for a table in the form of the study's, rename %s in both "
+                    "tables "
+                    "and in the study", table.source, ", ".join(sorted(own)),
                 )  # fmt: skip
             return links_from_table(table, group, carrier if links.frequency else None)
         wide = {column: name for column, name in links.wide.items() if column in columns}
@@ -164,15 +164,15 @@ class Study(StudyModel):
             rows, table = len(table), select_rows(table, Preparation(track=row_track(self)))
             if len(table) < rows:
                 raise InputError(
-                    f"{table.source}: {rows - len(table)} of {rows} rows are outside the times of the track and have "
-                    f"no position; remove them"
+                    f"{table.source}: {rows - len(table)} of {rows} rows have times outside the track and therefore no "
+                    "position; remove these rows"
                 )
         elif not wide and not columns & {*links.tx, *links.rx}:
             return links_from_table(table, group, links.frequency)
         return links_from_table(table, group, links.frequency, steps=steps, tx=links.tx, rx=links.rx)
 
     def opened(self) -> Setup:
-        """The opened study: its links, scene and parameters are read (see `Setup.open`)."""
+        """The opened study, for which the links, the scene and the parameters are read (see `Setup.open`)."""
         return Setup.open(self)
 
 
@@ -211,19 +211,19 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 VALUE: Final = "measured"
 LARGEST_PERMITTIVITY: Final = 15.0
-"""Default upper bound of a calibrated permittivity: more than twice the largest permittivity of a building material in
+"""Default upper bound of a calibrated permittivity, more than twice the largest permittivity of a building material in
 ITU-R P.2040."""
 
 
 def permittivity_bounds(start: float) -> list[float]:
-    """Default bounds of a calibrated permittivity; wet ground has a far higher permittivity than buildings."""
+    """Default bounds of a calibrated permittivity. Wet ground has a much higher permittivity than buildings."""
     return [1.5, max(LARGEST_PERMITTIVITY, round(2 * start))]
 
 
 def _write_live_study(
     scene: object, measured: Any, folder: Path, sections: Mapping[str, Any], overwrite: bool
 ) -> dict[str, Any]:
-    """Write the files of a scene in memory and its measured values, and return the content of the study.
+    """Write the files of a scene in memory and the measured values, and return the content of the study.
 
     Raises:
         InputError: The scene or the measured values cannot be used, or the folder cannot be written.
@@ -231,7 +231,9 @@ def _write_live_study(
     from calibray.tracing.sionna.live_scene import LiveScene
 
     if "scene" in sections:
-        raise InputError("scene: the scene in memory states the carrier; set scene.frequency there")
+        raise InputError(
+            "scene: the carrier is that of the scene in memory; set its attribute frequency instead"
+        )
     live = LiveScene.of(scene)
     links = dict(sections.get("links", {}))
     table = _links(live, measured)
@@ -275,13 +277,14 @@ def _write_live_study(
 
 
 def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
-    """One row for each measured value, with the names of both ends."""
+    """A table with one row per measured value and the names of both ends."""
     values = _matrix(live, measured)
     tx, rx = (np.array(list(ends.values())) for ends in (live.tx, live.rx))
     row, column = np.nonzero(~np.isnan(values))
     if not len(row):
         raise InputError(
-            "measured: no value is a number; give one for each transmitter and receiver, NaN if none"
+            "measured: no value is a number; give a value for each transmitter and receiver, or NaN where nothing was "
+            "measured"
         )
     table = pd.DataFrame(np.hstack([tx[row], rx[column]]), columns=list(POSITION_COLUMNS))
     return table.assign(
@@ -302,18 +305,18 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
                 raise InputError(f"measured: {what} {label!r} is repeated; give one {what} for each {kind}")
             if unknown := [str(label) for label in labels if label not in names]:
                 raise InputError(
-                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows are transmitters, "
-                    "columns receivers"
+                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows are transmitters, and columns "
+                    "are receivers"
                 )
         measured = measured.reindex(index=list(live.tx), columns=list(live.rx)).to_numpy()
     elif isinstance(measured, str | Path):
         raise InputError(
-            f"measured: is the text {shortened(str(measured))!r}, must be values; read a file first, for instance by "
-            "pandas.read_csv(file, index_col=0)"
+            f"measured: is the text {shortened(str(measured))!r}, must be values; read the file first, for instance "
+            "with pandas.read_csv(file, index_col=0)"
         )
     elif hasattr(measured, "columns"):
         raise InputError(
-            f"measured: is a {type_name(measured)}, whose rows have no names; give a pandas DataFrame with names of "
+            f"measured: is a {type_name(measured)}, which has no row names; give a pandas DataFrame with names of "
             "transmitters as rows (.to_pandas().set_index(...)), or an array in the order of the scene (.to_numpy())"
         )
     try:
@@ -322,7 +325,7 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
         raise InputError(f"measured: is not a matrix of numbers ({first_line(error)})") from None
     if given.shape != (shape := (len(live.tx), len(live.rx))):
         raise InputError(
-            f"measured: shape {given.shape}, must be {shape}: a row for each transmitter, a column for each receiver"
+            f"measured: shape {given.shape}, must be {shape}: one row per transmitter and one column per receiver"
         )
     present = ~(np.ma.getmaskarray(given) | pd.isna(np.ma.getdata(given)))
     values, stated = np.full(shape, np.nan), np.ma.getdata(given).astype(object)

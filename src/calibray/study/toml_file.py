@@ -1,4 +1,4 @@
-"""The text of a study file: TOML, environment variables in file names, and keys of several engines."""
+"""Processing of study files: TOML, environment variables in file names, and keys of several engines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from calibray.support.strict_models import CLOSED, describe_fault
 SCHEMA_FILE: Final = "study.schema.json"
 HEADING: Final = (
     f"#:schema {SCHEMA_FILE}\n"
-    "# Drafted by `calibray init`. Comments give the reason for each assumption: check antennas and heights first.\n"
+    "# Drafted by `calibray init`. Comments state the reason for each assumption. Check antennas and heights first.\n"
 )
 
 
@@ -41,14 +41,14 @@ def read_content(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
+        raise InputError(f"{path}: not UTF-8 text; save the file as UTF-8") from None
     except (ValueError, RecursionError) as error:
         # In addition to malformed TOML: a number with thousands of digits, or lists nested thousands of levels deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
 
 
 def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
-    """The text of a study file; comments state `reasons` of assumptions, given by dotted name of a section or key.
+    """The text of a study file. Comments state the `reasons` for assumptions, by dotted name of the section or key.
 
     Raises:
         InputError: A name has characters that TOML cannot contain.
@@ -64,13 +64,13 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     # For any names in a table, the file must state exactly what was drafted.
     if not agrees:
         raise InputError(
-            "draft: a column or group has a name that a study cannot contain; rename it in the table"
+            "draft: the name of a column or group cannot be written in TOML; rename the column or group in the table"
         )
     return text
 
 
 def reasons_in(text: str) -> dict[str, str]:
-    """The comments that follow sections and keys in a study file, by dotted name; empty if it is not TOML."""
+    """The comments after sections and keys in a study file, by dotted name; empty if the text is not TOML."""
     try:
         document = tomlkit.parse(text)
     except ValueError:
@@ -84,7 +84,7 @@ def reasons_in(text: str) -> dict[str, str]:
 
 
 def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
-    """A section, or a value before the first section."""
+    """A section, or a value that precedes the first section."""
     if not isinstance(section, Mapping):
         return _item(section)
     table = tomlkit.table()
@@ -94,12 +94,12 @@ def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
 
 
 def _commented(item: Any, reason: str | None) -> Any:
-    """An item with a one-line comment: a line break in a column's name would end it, and the rest would be TOML."""
+    """An item with a one-line comment. Text after a line break in the comment would be read as TOML."""
     return item.comment(printable(reason)) if reason else item
 
 
 def _item(value: Any) -> Any:
-    """A value in TOML, with inline tables; large numbers become 3.5e9, for instance, instead of 3500000000."""
+    """A value in TOML, with inline tables. Large numbers are written as 3.5e9, for instance, instead of 3500000000."""
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         table.update({key: _item(part) for key, part in value.items()})
@@ -118,14 +118,14 @@ def _item(value: Any) -> Any:
 
 
 def _with_lists(value: Any) -> Any:
-    """A value with lists in place of tuples, as in parsed TOML."""
+    """A value with lists instead of tuples, as in parsed TOML."""
     if isinstance(value, Mapping):
         return {key: _with_lists(part) for key, part in value.items()}
     return [_with_lists(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
-    """Raise an error for ``walls.thickness = ...``: TOML reads it as a table "walls" with a key "thickness"."""
+    """Raise an error for ``walls.thickness = ...``, which TOML reads as a table "walls" with a key "thickness"."""
     for name, entry in parameters.items() if isinstance(parameters, Mapping) else ():
         for key, value in entry.items() if isinstance(entry, Mapping) else ():
             if isinstance(value, Mapping) and key not in ParameterSection.model_fields:
@@ -135,10 +135,10 @@ def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
 
 
 def expand(text: str, environment: Mapping[str, str]) -> str:
-    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` if it may be unset or empty.
+    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` with a default for unset or empty variables.
 
     Raises:
-        InputError: A variable without default is not set, or a ``${`` is malformed.
+        InputError: A variable without a default is not set, or a ``${`` is malformed.
 
     Example:
         >>> expand("${HERE:-there}/links.csv", {})
@@ -150,7 +150,9 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
         if environment.get(name):
             return environment[name]
         if default is None:
-            raise InputError(f"environment variable {name} is not set; set it, or write ${{{name}:-DEFAULT}}")
+            raise InputError(
+                f"environment variable {name} is not set; set the variable, or write ${{{name}:-DEFAULT}}"
+            )
         return default
 
     expanded, count = re.subn(r"\$\{([A-Za-z_]\w*)(?::-([^{}]*))?\}", value, text)
@@ -160,12 +162,12 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
 
 
 def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
-    """Split the table ``[engine]`` into the keys of the engine that it names and the keys of other engines.
+    """Split the table ``[engine]`` into the keys of the named engine and the keys of other engines.
 
-    A study may state how its program is called and still use replay; `calibray run --engine command` then calls it.
+    A study can state the command of a program and use replay; `calibray run --engine command` then calls the program.
 
     Raises:
-        InputError: Another engine cannot use the value of its key.
+        InputError: The value of a key of another engine is invalid.
     """
     # The study's own validation rejects a value that is not a table or does not name an engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
@@ -185,7 +187,7 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _fault(field: FieldInfo, value: Any) -> str | None:
-    """The error in the value of a key; None if there is none."""
+    """The error in the value of a key; None if the value is valid."""
     # The type is composed at run time, which type checkers do not support.
     annotated: Any = Annotated
     checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)

@@ -62,15 +62,15 @@ def trace(
     """Find the paths of every link and compile them.
 
     Args:
-        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read. Alternatively a study,
-            which states its links, carrier, antennas and settings; its trace is cached.
-        measurements: The links; their values and carriers are not used (use `Paths.at` for another carrier). With a
-            study, these links replace the study's.
+        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a `Scene`. Alternatively, a study, which states
+            links, carrier, antennas and settings. The trace of a study is cached.
+        measurements: The links. Their measured values and carriers are not used (see `Paths.at` for other carriers).
+            With a study, these links replace those of the study.
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna, in the same form.
-        materials: Constants by material name, which replace the scene's or a study's start values. With a study or a
-            scene already read, each must be a `Material`.
+        materials: Constants by material name, which replace those of the scene or the start values of a study. With a
+            study or a `Scene`, each value must be a `Material`.
         progress: Called with ("tracing", receivers traced, number of receivers) after every launch.
         **settings: The attributes of `TraceSettings`.
 
@@ -78,15 +78,17 @@ def trace(
         The path program; `links_without_path` lists the links without a path.
 
     Raises:
-        InputError: The study, the scene, an antenna, a setting or a position cannot be used; or an argument is missing,
-            or is given although the study states it.
+        InputError: The study, the scene, an antenna, a setting or a position cannot be used. An argument is missing, or
+            is given although the study states its value.
         EngineError: The paths do not fit into memory.
     """
     if isinstance(scene, Study):
         arguments = {"frequency": frequency, "tx_antenna": tx_antenna, "rx_antenna": rx_antenna, **settings}
         for name, value in arguments.items():
             if value is not None:
-                raise InputError(f"trace: the study {scene.path} states {name}; change it there")
+                raise InputError(
+                    f"trace: the study {scene.path} states {name}; change the value in the study"
+                )
         return _trace_study(scene, measurements, materials or {}, progress)
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
@@ -110,8 +112,8 @@ def trace(
 def _trace_study(study: Study, links: Links | None, materials: Constants, progress: Progress | None) -> Paths:
     if not isinstance(links, Measurements | None):
         raise InputError(
-            f"trace: the links of a study must be Measurements, not a {type_name(links)}; read_measurements reads a "
-            "file, Measurements(tx, rx, path_loss_db) takes arrays"
+            f"trace: the links of a study must be Measurements, not a {type_name(links)}; use read_measurements(...) "
+            "for a file, or Measurements(tx, rx, path_loss_db) for arrays"
         )
     return Setup.open(study, links=links).trace(_complete(materials, "a study"), progress)
 
@@ -121,7 +123,7 @@ def _complete(materials: Constants, source: str) -> dict[str, Material]:
     for name, constants in materials.items():
         if not isinstance(constants, Material):
             raise InputError(
-                f"trace: materials of {source}: {name!r} is not a Material; give all its constants as a Material"
+                f"trace: materials of {source}: {name!r} is not a Material; give all constants as a Material"
             )
         complete[name] = constants
     return complete
@@ -138,26 +140,27 @@ def read_rays(
 ) -> Paths:
     """Read the paths of any engine (docs/reference/ray-table.md).
 
-    If the table states the powers of the paths, the program has a correction: with the materials of the scene, or the
-    study's start values, every path then has the power stated in the table.
+    If the table contains the powers of the paths, the path program has a correction. With the materials of the scene,
+    or the start values of the study, every path then has the power stated in the table.
 
     Args:
-        rays: The table: a .csv, .parquet, .json or .h5 file, or its rows. Alternatively the paths of another program: a
-            .p2m file of Wireless InSite, the folder of an AODT run or of a DeepMIMO scenario, or Sionna RT's `Paths`.
-        scene: Mitsuba XML file, `sionna:NAME`, or a scene already read, with the constants that the engine used.
-            Alternatively a study, which states carrier and links; its start values must be those that the engine used.
+        rays: The ray table: a .csv, .parquet, .json or .h5 file, or a DataFrame of its rows. Alternatively, the paths
+            of another program: a .p2m file of Wireless InSite, the folder of an AODT run or a DeepMIMO scenario, or the
+            `Paths` of Sionna RT.
+        scene: Mitsuba XML file, `sionna:NAME`, or a `Scene`, with the constants that the engine used. Alternatively, a
+            study, which states carrier and links and must have the start values that the engine used.
         frequency: Carrier frequency [Hz]; only without a study.
-        antennas: Transmit and receive antenna that the engine used. By default, those of the study, if it states them;
-            otherwise the correction contains the antennas.
-        axes: The table's axes along x, y and z of the scene, such as "x -z y" for a table whose y axis points up.
+        antennas: Transmit and receive antennas that the engine used. By default, these are the antennas that the study
+            states. Without stated antennas, the correction includes the antenna gains.
+        axes: Axes of the table along x, y and z of the scene, such as "x -z y" for a table with an upward y axis.
         tx_power_dbm: Transmitted power [dBm], for a file that states received power (Wireless InSite).
 
     Returns:
-        The path program. With a study, it has the study's links; without a study, it has the table's links, identified
-        by label or position; labels are in order, `rx2` before `rx10`.
+        The path program, with the links of the study. Without a study, it has the links of the table, identified by
+        label or position. Labels are sorted naturally, with `rx2` before `rx10`.
 
     Raises:
-        InputError: The table, the scene or an antenna cannot be used, or they are inconsistent.
+        InputError: The table, the scene or an antenna cannot be used or is inconsistent with the others.
 
     Example:
         >>> from calibray.scenarios import demo_study_path
@@ -172,15 +175,15 @@ def read_rays(
         and all(isinstance(each, Antenna) for each in antennas)
     ):
         raise InputError(
-            f"read_rays: antennas = {antennas!r}: must be two Antenna, for transmitter and receiver"
+            f"read_rays: antennas = {antennas!r}: must be two Antenna objects, for transmitter and receiver"
         )
     rows = ray_rows(rays, tx_power_dbm)
     if isinstance(scene, Study | Setup):
         if frequency is not None:
-            raise InputError("read_rays: the study states the frequency; change it there")
+            raise InputError("read_rays: the study states the frequency; change the value in the study")
         setup = scene.opened()
         if setup.links.frequency is not None:
-            raise InputError("read_rays: a ray table states powers at one carrier; leave out links.frequency")
+            raise InputError("read_rays: a ray table contains powers at one carrier; remove links.frequency")
         setting = RaySetting.of(setup)
         setting = setting if antennas is None else replace(setting, antennas=antennas)
     elif frequency is None:
@@ -194,9 +197,10 @@ def read_rays(
 
 
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:
-    """Write paths as a ray table for other engines and programs; powers are computed with the paths' materials.
+    """Write paths as a ray table for other engines and programs; powers are computed with the materials of `paths`.
 
-    The file name ends in .csv, .parquet, .json or .h5; `overwrite` replaces a file that Calibray did not write.
+    The file name must end in .csv, .parquet, .json or .h5. With `overwrite`, even a file that Calibray did not write is
+    replaced.
 
     Raises:
         InputError: The file cannot be written.

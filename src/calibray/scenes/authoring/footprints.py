@@ -377,7 +377,7 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
     is_polygon = np.isin(shapely.get_type_id(outlines), (3, 6))
     if not is_polygon.any():
         raise InputError(
-            f"footprints {path}: none of its {len(outlines)} features is a polygon; give outlines of buildings"
+            f"footprints {path}: none of the {len(outlines)} features is a polygon; give outlines of buildings"
         )
     columns = {name: values[is_polygon] for name, values in features.columns.items()}
     return outlines[is_polygon], columns, features.crs
