@@ -181,7 +181,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
         more = f" and {len(unknown) - MAX_LISTED} more" if len(unknown) > MAX_LISTED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
-            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add these, or remove their rows with links.where, as in "
+            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add these, or remove the rows with links.where, as in "
             f'where = "`{key}` not in [{cells}]"'
         )
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
