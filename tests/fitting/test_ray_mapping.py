@@ -24,7 +24,7 @@ from calibray.fitting.ray_model import ANGLES, BATCH, HALF_SPACE, LEAST_DB, Call
 from calibray.materials import Material
 from calibray.optimizers.evaluations import Best
 from calibray.parameters import Parameter, Parameters
-from calibray.paths import Kind, Paths
+from calibray.paths import Kind, Paths, take
 from calibray.paths.chains import spherical_basis
 from calibray.result.wording import remark_text
 from calibray.study import Setup
@@ -260,6 +260,16 @@ def test_values_at_the_bounds_make_materials() -> None:
     model = RayModel.of(WALLS, paths, False)
     for values in model.bounds:
         assert model.materials(np.array([3.3]), values)["ground"].relative_permittivity >= 1.0
+
+
+def test_paths_around_both_edges_of_a_thin_wall_are_not_mixed_up() -> None:
+    """Their points are closer together than the tolerance for points that are the same."""
+    paths = synthetic.program([(Kind.DIFFRACTION,)] * 2, links=1)
+    paths = replace(paths, vertex=np.array([[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]]))
+    for index in ([0, 1], [1, 0], [1]):
+        here, there = ray_fit.common(paths, take(paths, np.array(index)))
+        np.testing.assert_array_equal(there, [index.index(number) for number in here])
+        np.testing.assert_array_equal(here, sorted(index))
 
 
 def test_a_ray_of_power_zero_is_absent(foreign: Foreign) -> None:

@@ -372,15 +372,21 @@ def ratios_of(calls: list[Call]) -> list[Ratio]:
 
 def common(one: Paths, other: Paths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Indices, in each of two programs, of the paths with the same link, kinds and points."""
-    rows, pairs = _by_kinds(other), []
+    rows, partner = _by_kinds(other), {}
     for key, members in _by_kinds(one).items():
-        for index, points in members:
-            same = (
-                k for k, others in rows.get(key, ()) if np.abs(points - others).max(initial=0) <= TOLERANCE
-            )
-            if (match := next(same, None)) is not None:
-                pairs.append((index, match))
-    here, there = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2).T
+        near = [
+            (gap, index, k)
+            for index, points in members
+            for k, others in rows.get(key, ())
+            if (gap := float(np.abs(points - others).max(initial=0))) <= TOLERANCE
+        ]
+        taken = set()
+        # The nearest pairs come first: both edges of a thin wall are within the tolerance of one another.
+        for _, index, k in sorted(near):
+            if index not in partner and k not in taken:
+                partner[index] = k
+                taken.add(k)
+    here, there = np.array(sorted(partner.items()), dtype=np.int64).reshape(-1, 2).T
     return here, there
 
 
