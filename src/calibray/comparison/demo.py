@@ -128,7 +128,7 @@ class Demo:
         optimum_db: RMSE of the global optimum [dB], found by `auto` on stored paths.
         truth: True mean permittivities by material.
         engine: Engine used by the paper's methods.
-        trace_seconds: Time to load and trace the district [s], which replay requires only once.
+        trace_seconds: Time to load and trace the district [s]; replay requires this only once.
     """
 
     results: dict[str, Result]

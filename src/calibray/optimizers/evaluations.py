@@ -72,7 +72,7 @@ class Evaluations:
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
-        """Concatenate at least one set of evaluations, all with the same optional parts."""
+        """Concatenate one or more sets of evaluations that have the same optional parts."""
 
         def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
             present = [array for array in arrays if array is not None]

@@ -1,8 +1,8 @@
 """Interfaces of optimizers (`ask` returns candidates, `tell` receives their evaluations) and of optional cheap models.
 
-An algorithm is written as in its paper: a generator that yields the candidates [n, d] of each iteration and receives
-their evaluations. A `Session` suspends it between `ask` and `tell`, checks the evaluations, keeps the archive, and
-collects the answers to a batch, which can arrive in any order and in portions.
+An algorithm is a generator that yields the candidates [n, d] of each iteration and receives their evaluations, so that
+its code can follow its paper. A `Session` suspends the algorithm between `ask` and `tell`, checks the evaluations,
+keeps the archive, and collects the answers to a batch, which can arrive in any order and in portions.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Session:
                 self._open = np.delete(self._open, same[0])
 
     def _advance(self) -> None:
-        """Compute the next batch if this one is complete."""
+        """Compute the next batch if the current batch is complete."""
         if self._finished or len(self._open):
             return
         answers = [self._answers[row] for row in sorted(self._answers)]
@@ -238,7 +238,7 @@ class Optimizer(ABC):
         return len(self._session.archive)
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates [n, d] to evaluate next, inside the bounds: those of the current batch without an answer.
+        """The candidates [n, d] to evaluate next, inside the bounds: the unanswered candidates of the current batch.
 
         Raises:
             InputError: The optimizer is done.

@@ -34,7 +34,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 @final
 class Ledger:
-    """RT calls by problem and candidate.
+    """Stored RT calls by problem and candidate.
 
     Args:
         path: The SQLite file; created with its folder if absent. A file that cannot be written is opened read-only.

@@ -285,7 +285,7 @@ class Misfit(NamedTuple):
 
     Attributes:
         value: Negative log density of the answers and the constants, up to a constant [s].
-        scale: Factor on the variances of the discrepancy that makes the answers most probable [s].
+        scale: Factor for the variances of the discrepancy that makes the answers most probable [s].
     """
 
     value: NDArray[np.float64]
@@ -364,7 +364,7 @@ class Averaged:
     """Corrected models that explain the same answers.
 
     Attributes:
-        members: The models, the most likely one first.
+        members: The models, with the most likely one first.
     """
 
     members: tuple[Corrected, ...]
