@@ -155,36 +155,36 @@ def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a
     assert model.name == Model.AVERAGE_INITIAL
     assert Model.AVERAGE_INITIAL in result.held_out.table.index
     assert errors[Model.AVERAGE_INITIAL] == pytest.approx(
-        (errors[Model.INITIAL] + errors[Model.PRIOR]) / 2, nan_ok=True
+        (errors[Model.INITIAL] + 2 * errors[Model.PRIOR]) / 3, nan_ok=True
     )
     assert model.residual_db == pytest.approx(np.sqrt(np.nanmean(errors[Model.AVERAGE_INITIAL] ** 2)))
     assert model.averaged == pytest.approx(initial)
     assert min(abs(model.parameters[name] - value) for name, value in initial.items()) > 0.01
-    # The prediction is the mean of the predictions of both models.
+    # The prediction is the weighted mean of the predictions of both models; only the initial materials have terms.
     alone = [
         replace(model, averaged=None, parameters=values, terms=terms)
         for values, terms in (
             (model.parameters, ()),
-            (model.averaged, tuple(_doubled(term) for term in model.terms)),
+            (model.averaged, tuple(_tripled(term) for term in model.terms)),
         )
     ]
     both = [replace(result, prediction=replace(result.prediction, model=one)).predict(links) for one in alone]
     assert np.abs(both[0] - both[1]).max() > 0.3
-    assert result.predict(links) == pytest.approx(np.mean(both, axis=0), abs=1e-9)
+    assert result.predict(links) == pytest.approx((2 * both[0] + both[1]) / 3, abs=1e-9)
     assert result.links.predicted_db.to_numpy() == pytest.approx(result.predict(links), abs=1e-6)
     half = result.predict_interval(links)
     assert half["path_loss_db"].to_numpy() == pytest.approx(result.predict(links), abs=1e-9)
     result.save(tmp_path / "out")
     assert Result.load(tmp_path / "out").predict(links) == pytest.approx(result.predict(links), abs=1e-9)
     assert (
-        "materials calibrated with a prior, averaged with the initial ones, and the fitted constant"
+        "materials calibrated with a prior, averaged with the initial ones (weight 1/3), and the fitted constant"
         in prediction_text(result)
     )
     assert "average" in scene_alone_text(result)
 
 
-def _doubled(term: FittedTerm) -> FittedTerm:
-    return replace(term, coefficients={label: 2 * value for label, value in term.coefficients.items()})
+def _tripled(term: FittedTerm) -> FittedTerm:
+    return replace(term, coefficients={label: 3 * value for label, value in term.coefficients.items()})
 
 
 def test_the_mean_of_terms_keeps_groups_that_one_model_lacks() -> None:
@@ -196,4 +196,8 @@ def test_the_mean_of_terms_keeps_groups_that_one_model_lacks() -> None:
     assert averaged_terms((offset,), more) == (
         replace(offset, coefficients={"b": 4.0, "a": 4.0, "c": 1.0}),
         FittedTerm("tx", "constant", "tx", {"1": 2.5}, 0.0, 2.0),
+    )
+    assert averaged_terms((offset,), more, 0.75) == (
+        replace(offset, coefficients={"b": 4.0, "a": 3.0, "c": 1.0}),
+        FittedTerm("tx", "constant", "tx", {"1": 1.25}, 0.0, 1.0),
     )

@@ -29,7 +29,7 @@ from calibray.prediction.corrections import (
     nuisance_shift,
 )
 from calibray.prediction.observables import Replayed, as_measured, further_observables
-from calibray.result.held_out import NEW_GROUP, Model, PredictionModel
+from calibray.result.held_out import AVERAGES, NEW_GROUP, Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
 from calibray.scenes.checks.positions import INSIDE, locate
@@ -405,8 +405,10 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
     # Path loss is limited to the ceiling, as in the fit and on held-out links.
     ceiling_db = result.study.objective.ceiling_db
     path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
-    mean_db = path_loss_db[: replayed.averaged].mean(axis=0, keepdims=True)
-    return np.vstack([mean_db, path_loss_db[replayed.averaged :]])
+    best_db = path_loss_db[0]
+    if replayed.averaged > 1:
+        best_db = AVERAGES[result.prediction.model.name].of(best_db, path_loss_db[1])
+    return np.vstack([best_db, path_loss_db[replayed.averaged :]])
 
 
 def _path_loss(replayed: Replayed) -> NDArray[np.float64]:

@@ -47,7 +47,7 @@ def prediction_text(record: Record) -> str:
 
 
 _AVERAGED: Final = {
-    Model.AVERAGE_INITIAL: "the initial ones",
+    Model.AVERAGE_INITIAL: "the initial ones (weight 1/3)",
     Model.AVERAGE_CALIBRATED: "those of a fit with a prior",
     Model.AVERAGE_OFFSETS: "those of a fit with a prior and offsets",
 }

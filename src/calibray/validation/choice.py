@@ -99,8 +99,9 @@ def fit_prediction_model(
     """
     setup, parameters = problem.setup, problem.parameters
     uses_scene = name not in WITHOUT_MATERIALS
-    names = AVERAGES.get(name, (Model(name) if uses_scene else Model.CALIBRATED,))
-    variant, *others = (fit_variant(problem, trail, each) for each in names)
+    average = AVERAGES.get(name)
+    first = average.first if average else Model(name) if uses_scene else Model.CALIBRATED
+    variant = fit_variant(problem, trail, first)
     candidate, scene_db = variant.candidate, variant.modelled
     objective, modelled = variant.objective, scene_db
     if not uses_scene:
@@ -109,9 +110,14 @@ def fit_prediction_model(
             setup.links, problem.objective, models.without_scene(setup.study, setup.links)
         )
     terms, path_loss_db = fitted_terms(objective, modelled, setup.study), objective.with_nuisance(modelled)
-    for other in others:
-        terms = averaged_terms(terms, fitted_terms(other.objective, other.modelled, setup.study))
-        path_loss_db = (path_loss_db + other.objective.with_nuisance(other.modelled)) / 2
+    averaged = None
+    if average is not None:
+        other = fit_variant(problem, trail, average.second)
+        averaged = parameters.named(other.candidate)
+        terms = averaged_terms(
+            terms, fitted_terms(other.objective, other.modelled, setup.study), average.weight
+        )
+        path_loss_db = average.of(path_loss_db, other.objective.with_nuisance(other.modelled))
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
@@ -121,7 +127,7 @@ def fit_prediction_model(
         residuals.links,
         quantiles(np.sort(np.abs(residuals.errors_db))),
         residuals.blocks,
-        parameters.named(others[0].candidate) if others else None,
+        averaged,
     )
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
     # In an exported scene, each mesh has one material, facades have the material of their walls, and links are at the
@@ -167,11 +173,14 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
     return FittedVariant(problem.parameters.from_search(point), variant.objective, modelled)
 
 
-def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
-    """The mean of the terms of two models, of which the second has all terms of the first.
+def averaged_terms(
+    few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...], weight: float = 0.5
+) -> tuple[FittedTerm, ...]:
+    """The weighted mean of the terms of two models; the second model has all terms of the first.
 
-    The coefficients of a term that the first model lacks are halved. If a group has no coefficient in one model, that
-    of the other model is used.
+    The first model has the given weight. Coefficients and spreads of a term that it lacks are multiplied by the weight
+    of the second. If a group has no coefficient in one
+    model, that of the other model is used.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:
@@ -179,10 +188,10 @@ def averaged_terms(few: tuple[FittedTerm, ...], more: tuple[FittedTerm, ...]) ->
         if term.name in known:
             others = known[term.name].coefficients
         elif spread_db is not None:
-            spread_db = spread_db / 2
+            spread_db = (1.0 - weight) * spread_db
         # The coefficients of each model, completed by those of the other.
-        pairs = ({**others, **term.coefficients}, {**term.coefficients, **others})
-        means = {label: (pairs[0][label] + pairs[1][label]) / 2 for label in pairs[0]}
+        first, second = {**term.coefficients, **others}, {**others, **term.coefficients}
+        means = {label: weight * first[label] + (1.0 - weight) * second[label] for label in second}
         averaged.append(replace(term, coefficients=means, spread_db=spread_db))
     return tuple(averaged)
 

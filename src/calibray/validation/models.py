@@ -302,9 +302,9 @@ def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) 
 def averages(path_loss_db: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     """Path loss of every average for which both models are given, by name [links], [dB]."""
     return {
-        average: (path_loss_db[first] + path_loss_db[second]) / 2
-        for average, (first, second) in AVERAGES.items()
-        if {first, second} <= path_loss_db.keys()
+        name: average.of(path_loss_db[average.first], path_loss_db[average.second])
+        for name, average in AVERAGES.items()
+        if {average.first, average.second} <= path_loss_db.keys()
     }
 
 

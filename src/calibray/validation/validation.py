@@ -131,7 +131,7 @@ class Validation(HeldOutErrors):
         errors = self._on(self.judged)
         best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         chosen = choose(errors, self.position[self.judged])
-        partner = next((name for name in AVERAGES.get(self.chosen, ()) if name != chosen), None)
+        partner = next((name for name in AVERAGES.get(self.chosen, ())[:2] if name != chosen), None)
         return choice_text(chosen, best, partner)
 
     def scale(self, name: str) -> float:
