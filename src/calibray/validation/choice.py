@@ -179,8 +179,7 @@ def averaged_terms(
     """The weighted mean of the terms of two models; the second model has all terms of the first.
 
     The first model has the given weight. Coefficients and spreads of a term that it lacks are multiplied by the weight
-    of the second. If a group has no coefficient in one
-    model, that of the other model is used.
+    of the second. If a group has no coefficient in one model, that of the other model is used.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:
