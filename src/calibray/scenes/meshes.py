@@ -56,8 +56,8 @@ class Mesh:
         vertices: Positions [V, 3], [m].
         faces: Vertex indices of each triangle, counter-clockwise when seen from outside [F, 3].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
-        misread: Whether the tracer must read a PLY copy instead, because the file stores integer coordinates, Mitsuba
-            would shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
+        misread: Whether the tracer must read a PLY copy instead. This applies if the file stores integer coordinates,
+            if Mitsuba would shear the shape, or if the shape is a rectangle, which is not a mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]

@@ -23,7 +23,7 @@ from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, v
 from calibray.support.lazy_imports import library
 
 STEP: Final = 5.0
-"""Spacing of the points at which a line's height above ground is computed [m]; with this spacing, lengths in a wood on
+"""Spacing of the points at which a line's height above ground is computed [m]. With this spacing, lengths in a wood on
 50 m hills have errors of 0.1 m."""
 
 LINES: Final = 5000

@@ -1,7 +1,7 @@
 """Shapes of a scene in the scene frame: double-precision transforms, sizes, and copies for the tracer.
 
 A ray tracer computes in single precision, whose spacing is about 0.1 mm at 1 km from the origin and 0.5 m at UTM
-northings. A scene far from the origin is therefore traced in a local frame: this module reads and moves its meshes in
+northings. A scene far from the origin is therefore traced in a local frame. This module reads and moves its meshes in
 double precision, and only then rounds them.
 """
 
@@ -53,8 +53,8 @@ class SurfaceSize:
         area: Area [m^2].
         sides: Total length of the sides of all triangles [m].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
-        misread: Whether the tracer needs a copy, because the file stores integer coordinates, the shape is a rectangle,
-            or its transform rotates about a vector that is not a unit vector.
+        misread: Whether the tracer needs a copy. This applies if the file stores integer coordinates, if the shape is a
+            rectangle, or if its transform rotates about a vector that is not a unit vector.
     """
 
     low: tuple[float, float, float]
@@ -194,7 +194,7 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame in which a scene is traced.
 
     For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. A
-    scene is far if its largest coordinate exceeds both `FAR` and the scene's extent, so that the local frame gains at
+    scene is far if its largest coordinate exceeds both `FAR` and the scene's extent. The local frame then gains at
     least one bit of precision. Otherwise the local origin is zero.
     """
     if not sizes:

@@ -187,7 +187,7 @@ class GainTable:
     Attributes:
         first_azimuth_deg: Azimuth of the first column [deg], from the antenna's x axis towards its y axis.
         gain_dbi: Gain [elevations, azimuths], [dBi]. Elevations run from -90 to 90 degrees in equal steps, including
-            the ends; azimuths run in equal steps around a full turn, the end of which is not repeated.
+            the ends. Azimuths run in equal steps around a full turn, without its end.
 
     Example:
         >>> GainTable(-180.0, np.zeros((181, 360))).efficiency
@@ -248,7 +248,7 @@ def read_gain_table(path: str | Path) -> GainTable:
 
     The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, with one row per direction in any order.
     Azimuths cover a full turn (-180 to 180 or 0 to 360, with or without the end), and elevations -90 to 90, both in
-    equal steps of at most 15 degrees; every pair of azimuth and elevation has a row. Principal cuts alone are not
+    equal steps of at most 15 degrees. Every pair of azimuth and elevation has a row. Principal cuts alone are not
     sufficient.
 
     Raises:

@@ -27,7 +27,7 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST_MAJOR = 17
 """Oldest accepted major version.
 
-Dr.Jit 1.5 rejects version 14 and older, and aborts on x86 with 15 and 16 ("Cannot select: fminimum"): LLVM has compiled
+Dr.Jit 1.5 rejects version 14 and older, and aborts on x86 with 15 and 16 ("Cannot select: fminimum"). LLVM has compiled
 `llvm.minimum` for x86 since version 17 (reviews.llvm.org D145634 and D148691).
 """
 

@@ -1,7 +1,7 @@
 """Splits a trace into launches that fit into memory, for any number of rays and receivers.
 
-A launch sends rays from one transmitter and searches for paths to several receivers, or the other way round
-(`starts_at_receivers`); below, *transmitter* means the end that sends the rays. The tracer stores data for every
+A launch sends rays from one transmitter and searches for paths to several receivers, or vice versa
+(`starts_at_receivers`). Below, *transmitter* means the end that sends the rays. The tracer stores data for every
 combination of ray, interaction and receiver, called a *lane*. The receivers of a transmitter are therefore split over
 launches; if one receiver needs too many lanes, the rays are split as well. Sionna's rays form a lattice of directions
 that does not depend on the seed. Each launch gets a share of the lattice, so all launches together send the same rays

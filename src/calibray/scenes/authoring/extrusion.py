@@ -195,7 +195,7 @@ def extrude(
 ) -> Shell:
     """Extrude buildings from their cells, with heights in the scene's frame.
 
-    Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]; bodies
+    Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]. Bodies
     that stand on the ground are open at the bottom, and all others are closed. Without `ground`, all bodies are closed.
     """
     outlines = [_rings(cell.polygon) for cell in cells]

@@ -74,7 +74,7 @@ def make_plan_scene(
 ) -> MadeScene:
     """Make a scene from a floor plan.
 
-    Walls that cross or meet share corners, and the end of a wall at the face of another wall is extended to the other
+    Walls that cross or meet share corners. If a wall ends at the face of another wall, it is extended to the other
     wall's centre line. Between its own bottom and top, a door or window replaces the wall on which it is drawn; the
     wall continues above and below. The same applies to any shorter line on a longer one, such as a door whose type has
     a different name.
@@ -85,8 +85,8 @@ def make_plan_scene(
         types: Materials by type, which extend or replace those in `TYPES`. A type that is an ITU-R P.2040 material,
             such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one type,
             each becomes a separate material.
-        lids: Which of `LIDS` to make: sheets over the whole area that walls enclose, with the floor at the lowest
-            bottom and the ceiling at the highest top.
+        lids: Which of `LIDS` to make. They cover the whole area that walls enclose; the floor is at the lowest bottom
+            and the ceiling at the highest top.
         merge: Whether to merge two parallel lines into one wall (`merge_faces`).
         overwrite: Whether to replace files that Calibray did not write.
 

@@ -1,7 +1,7 @@
 """Opening vector files and height models with a fixed list of drivers.
 
-GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG), and it
-chooses the driver by the file's content. This module opens only formats without references to other files. A file is
+GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG). It chooses
+the driver by the content of the file. This module opens only formats without references to other files. A file is
 recognized by its first bytes, and the sizes that it declares are checked before the data are read.
 """
 

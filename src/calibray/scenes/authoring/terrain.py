@@ -87,7 +87,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
 
     Returns:
         The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, for
-        example on water, the height of the nearest cell with a height is used; cells without a height are counted.
+        example on water, the height of the nearest cell with a height is used. Cells without a height are counted.
 
     Raises:
         InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the bounds

@@ -43,12 +43,12 @@ class MergedPlan:
 def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
-    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, and overlap over a length
-    that exceeds both their distance and half of the shorter line. Neither line may have a closer opposite face. Their
-    distance is at most `THICKEST`; it differs from a given thickness by at most a fifth of that thickness, or 2 cm if
-    that is more. Where one long face is opposite several short faces, as between a corridor and its rooms, each pair
-    becomes a sheet, and gaps of up to `THICKEST` between the sheets are closed. Sheets end midway between the faces'
-    ends, so that corners meet.
+    Two lines are faces of one wall if they are parallel and have the same type, bottom and top. They must also overlap
+    over a length that exceeds both their distance and half of the shorter line. Neither line may have a closer opposite
+    face. Their distance is at most `THICKEST`. It differs from a given thickness by at most a fifth of that thickness,
+    or 2 cm if that is more. Where one long face is opposite several short faces, as between a corridor and its rooms,
+    each pair becomes a sheet. Gaps of up to `THICKEST` between these sheets are closed. Sheets end midway between the
+    faces' ends, so that corners meet.
 
     Where one face is longer than the opposite face, the remaining part is kept as a sheet in the same plane. The short
     lines that close the outline of a wall are left out. If the walls of a type have no given thickness, their thickness

@@ -27,7 +27,7 @@ _FLAT: Final = 1e-10  # area below which a face counts as empty [m^2]
 
 CLOSE: Final = 0.01
 """Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, it reflected twice from sheets 1
-mm apart and found no path through walls 0.1 to 5 mm apart; a gap of 10 mm was enough. At 900 m, a gap of 100 mm was
+mm apart and found no path through walls 0.1 to 5 mm apart. A gap of 10 mm was enough. At 900 m, a gap of 100 mm was
 necessary."""
 
 _PARALLEL: Final = 0.999  # smallest cosine of the angle between the normals of parallel faces

@@ -130,11 +130,11 @@ def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
 def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
     """Reverse candidate paths, so that paths found from the receivers start at the transmitters.
 
-    Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions, so
-    candidates for one direction are also candidates for the other. Candidates are reversed before their geometry is
-    computed, so that paths searched from either end are identical to the last digit. Three properties depend on the
-    direction: the order of the interactions, the two ends, and the faces of an edge, because Sionna's 0-face is the
-    illuminated face.
+    Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions.
+    Candidates for one direction are therefore also candidates for the other. Candidates are reversed before their
+    geometry is computed, so that paths searched from either end are identical to the last digit. Three properties
+    depend on the direction: the order of the interactions, the two ends, and the faces of an edge, because Sionna's
+    0-face is the illuminated face.
     """
     if not buffer.buffer_size:
         return buffer

@@ -2,8 +2,8 @@
 
 Sionna keeps an interaction sequence (the objects with which a path interacts, in order) only if a receiver is visible
 from the point that a ray hit. Sionna therefore tests every hit of every ray with every receiver. Here, rays are
-launched in a scene in which nothing obstructs a receiver (`Unobstructed`), so the sequences depend only on the source
-and apply to all receivers.
+launched in a scene in which nothing obstructs a receiver (`Unobstructed`). The sequences therefore depend only on the
+source and apply to all receivers.
 
 Unfolding a sequence yields the points at which its paths must aim. By the method of images, a path with reflections is
 a straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the

@@ -1,7 +1,7 @@
 """Sionna RT's solver, stage by stage: candidate paths from rays, exact geometry from the method of images, and fields.
 
-The first two stages depend on the material constants only through the choice of a ray's next interaction, so their
-result is kept and compiled into a path program. The field stage is the reference against which replay is tested.
+The first two stages depend on the material constants only through the choice of a ray's next interaction. Their result
+is therefore kept and compiled into a path program. The field stage is the reference against which replay is tested.
 """
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
