@@ -154,19 +154,19 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
     ("section", "message"),
     [
         (SPREAD | {"unit": "dB"}, "given in s or ms"),
-        (SPREAD | {"path": "first"}, "only for a time of flight"),
+        (SPREAD | {"path": "first"}, "applies only to a time of flight"),
         (SPREAD | {"kind": "doppler"}, "rms_delay_spread"),
         (SPREAD | {"std": 0.0}, "std"),
         (SPREAD | {"file": "multipath.csv"}, "give exactly one of column"),
-        (SPREAD | {"edges": [0.0, 1e-7]}, "takes no edges"),
+        (SPREAD | {"edges": [0.0, 1e-7]}, "has no edges"),
         (PROFILE | {"edges": [0.0, 1e-7]}, "2 bin"),
         (PROFILE | {"edges": [0.0, 2e-7, 1e-7]}, "increasing"),
-        (PROFILE | {"kind": "azimuth_power_arrival"}, "takes no edges"),
+        (PROFILE | {"kind": "azimuth_power_arrival"}, "has no edges"),
         (
             {**PROFILE, "kind": "azimuth_power_arrival", "edges": [], "edges_deg": [0, 180, 400]},
             "must span at most 360",
         ),
-        ({**SPREAD, "column": None, "columns": ["a", "b"]}, "has one column"),
+        ({**SPREAD, "column": None, "columns": ["a", "b"]}, "has a single column"),
     ],
 )
 def test_impossible_observables_are_refused(tmp_path, table, section, message):

@@ -211,7 +211,7 @@ def replaced(index: int, line: str | None) -> list[str]:
         (replaced(40, "-150,-80,loud\n"), r"row 42, column 'gain_dbi': 'loud' is not a number"),
         (replaced(40, "-150,-80,\n"), r"column 'gain_dbi' is missing or not finite in 1 of 703 rows \(row 42\)"),
         (replaced(40, "-150,-80,-inf\n"), r"column 'gain_dbi' is missing or not finite"),
-        (replaced(40, "-150,-80\n"), r"row 42: 2 cells, the header has 3"),
+        (replaced(40, "-150,-80\n"), r"row 42: 2 cells, but the header has 3"),
         (replaced(40, "-150,-80,-300\n"), r"'gain_dbi': -300 must be -200 to 60 .*write a null as a low gain"),
         (replaced(40, "-150,-80,70\n"), r"'gain_dbi': 70 must be -200 to 60 .*check the unit"),
         (replaced(40, "-150,-100,0\n"), r"'elevation_deg': -100 must be -90 to 90 .*give degrees"),
