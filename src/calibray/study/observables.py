@@ -111,7 +111,8 @@ class ObservableSection(Section):
         for key, wanted in needed.items():
             if bool(getattr(self, key)) != wanted:
                 raise InputError(
-                    f"{key}: a {self.kind} {'needs' if wanted else 'has no'} {key}, the edges of bins"
+                    f"{key}: the kind {self.kind!r} "
+                    f"{'needs this key, the edges of the bins' if wanted else 'does not use this key; remove it'}"
                 )
         edges = np.array(self.edges or self.edges_deg)
         bins = len(edges) - 1 if self.file is not None else max(len(self.columns), 1)
