@@ -37,7 +37,9 @@ DIFFICULT = {
     "grazing incidence on metal": Material(1.0, 1e7, 0.1),
     "total loss": Material(30.0, 50.0, 0.2),
     "air": Material(1.0, 0.0, 0.1),
+    "grazing incidence on smoke": Material(1.0, 0.001, 0.02),
 }
+INTERVALS = {"grazing incidence on smoke": 64}
 _fill_tables, _exact = jax.jit(fill_tables), jax.jit(coefficients_of_materials)
 
 
@@ -48,7 +50,11 @@ def test_error_of_a_table_is_within_its_bound(case: str, mode: Mode) -> None:
     count, constants = len(cosine), constants_matrix({"one": DIFFICULT[case]})
     material, modes = np.zeros(count, dtype=int), np.full(count, mode)
     positions = table_layout(
-        (material, modes, cosine), spacing_roots(constants, WAVELENGTH), [np.arange(count)], 512, float
+        (material, modes, cosine),
+        spacing_roots(constants, WAVELENGTH),
+        [np.arange(count)],
+        INTERVALS.get(case, 512),
+        float,
     )
     wavelength, table = jnp.asarray(WAVELENGTH), jnp.asarray(constants)
     tables = _fill_tables(positions, table, wavelength)

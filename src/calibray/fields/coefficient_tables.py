@@ -72,7 +72,8 @@ class TableLayout:
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
-        inner: Whether a node has at least three other nodes of its row on either side [N].
+        rank: Number of every node in its row, 0 for the node before grazing incidence [N].
+        inner: Whether a node has at least three other nodes of its row, or their mirror images, on either side [N].
     """
 
     cell: tuple[jax.Array, ...]
@@ -80,6 +81,7 @@ class TableLayout:
     cosine: jax.Array
     material: jax.Array
     mode: jax.Array
+    rank: jax.Array
     inner: jax.Array
 
 
@@ -156,7 +158,8 @@ def table_layout(
         cosine=jax.device_put(np.maximum(node_cosine, _GRAZING).astype(dtype)),
         material=jax.device_put(material_of_node.astype(np.int32)),
         mode=jax.device_put((rows % len(Mode))[row_of_node].astype(np.int32)),
-        inner=jax.device_put((rank >= _STENCIL) & (rank <= last - _STENCIL)),
+        rank=jax.device_put(rank.astype(np.int32)),
+        inner=jax.device_put((rank > 0) & (rank <= last - _STENCIL)),
     )
 
 
@@ -213,7 +216,10 @@ def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: i
     def at(step: int) -> jax.Array:
         return jnp.roll(value, -step, axis=0)
 
-    gap = at(0) - 9 / 16 * (at(-1) + at(1)) + 1 / 16 * (at(-3) + at(3))
+    # Coefficients are even functions of the root of the cosine, so nodes beyond grazing incidence are mirror images.
+    rank = layout.rank[:, None]
+    before = jnp.where(rank == 1, at(3), jnp.where(rank == 2, at(1), at(-3)))
+    gap = at(0) - 9 / 16 * (at(-1) + at(1)) + 1 / 16 * (before + at(3))
     error = jnp.where(layout.inner, jnp.abs(gap).max(axis=1), 0.0) / 8
     row = layout.material * len(Mode) + layout.mode
     return jnp.zeros(num_materials * len(Mode), error.dtype).at[row].max(error).reshape(num_materials, -1)
