@@ -41,9 +41,9 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
         roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would explain
         the largest part of the residuals. "leverage": leverage and residual of every calibration link. "power": share
         of the links' power by material and type of interaction. "trade_offs": correlation of the draws of each pair of
-        unknowns. "neighbours": semivariance of the residuals by distance between links, including both ends. "moved":
-        value of every parameter before and after calibration, with the change and the width of the 95 % interval as
-        shares of its range.
+        unknowns. "neighbours": semivariance of the residuals by distance between links, computed from the positions of
+        both ends. "moved": value of every parameter before and after calibration, with the change and the width of the
+        95 % interval as shares of its range.
     """
     tables = {
         "distance": _by_distance(result),

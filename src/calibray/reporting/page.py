@@ -60,8 +60,8 @@ CAPTIONS: Final = {
     "held-out-blocks": "RMSE on each held-out block, by model.",
     "power": "Power by material and type of interaction: share of the links' power on paths that interact with the "
     "material. A path contributes to the share of each of its interactions.",
-    "neighbours": "Semivariance of the residuals versus distance between links (including both ends). If it increases "
-    "with distance, neighbouring links share part of their errors.",
+    "neighbours": "Semivariance of the residuals versus distance between links, computed from the positions of both "
+    "ends. If the semivariance increases with distance, neighbouring links share part of their errors.",
     "leverage": "Residual versus leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
     "residual contains no information about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
@@ -85,7 +85,7 @@ class PageData:
         links: The links with positions; None if these are unknown.
         scene: The scene; None if it can no longer be read.
         triangles: Meshes of the scene.
-        rays: Paths of the links; None if no link has a path.
+        rays: Paths of the links; None if these are not available.
         missing: Items that are not shown, with the reasons.
     """
 
