@@ -158,7 +158,7 @@ def test_starts_resolve_to_numbers(name, start, value):
     [
         ("wals.relative_permittivity", 2, "the scene has no material 'wals'; did you mean 'walls'"),
         ("walls.relative_permittivity", "itu:concret", "start = 'itu:concret': .*did you mean 'concrete'"),
-        ("walls.relative_permittivity", "itu:wet_ground", "not for 28.5 GHz"),
+        ("walls.relative_permittivity", "itu:wet_ground", "not at 28.5 GHz"),
         ("walls.relative_permittivity", "itu:concrete@P.2040-0", "revision = 'P.2040-0'"),
         ("walls.relative_permittivity", "concrete", "must be a number or 'itu:NAME'"),
         ("walls.relative_permittivity", nan, "start = nan: must be a finite number"),
