@@ -135,7 +135,10 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
 
 
 def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Measurements) -> int:
-    """Number of coefficients of a nuisance term, one per group; of a random effect, only the mean is free."""
+    """Number of coefficients of a nuisance term, one per group.
+
+    A random effect has one, because only the mean is free.
+    """
     if section.per is None or section.prior == "auto":
         return 1
     if section.per == CLUSTER and CLUSTER not in links.frame and study.cluster_m is not None:

@@ -38,7 +38,7 @@ _NEEDED: Final = {
     "regions": {"position": "file"},
     "facades": {"position": "file", "module": "share", "storey_height": "storeys"},
 }
-"""For each section of named tables, the keys that have no effect without another key of their table."""
+"""Keys that have no effect without another key of the same table, by section."""
 
 
 class StudyModel(StudyContent, ABC):
@@ -409,7 +409,7 @@ class StudyModel(StudyContent, ABC):
 
 
 def _keys_without_effect(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The keys of a valid study file that have no effect, each with the key that it needs."""
+    """The keys of a valid study file that have no effect, each with the missing key that it requires."""
     for section, keys in _NEEDED.items():
         for name, table in content.get(section, {}).items():
             for key, needed in keys.items():

@@ -464,7 +464,7 @@ class Setup:
 
 
 def input_digests(study: StudyModel, scene: Scene) -> dict[str, str]:
-    """SHA-256 of every file of a study's scene, regions, facades, antennas and rays, by its resolved path."""
+    """SHA-256 digests of the files of a study's scene, regions, facades, antennas and rays, by resolved path."""
     antennas = [*study.stated_antennas.values(), *study.antenna_types.values()]
     gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
     digests = {str(scene.path): hashlib.sha256(scene_content(scene.path)).hexdigest()}
