@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import synthetic
+from calibray import write_rays
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.materials import FIELDS
@@ -73,6 +75,18 @@ def test_a_saved_program_is_loaded_unchanged(
     file = tmp_path_factory.mktemp("paths") / "paths.h5"
     saved.save(file)
     assert_equal(Paths.load(file), saved)
+
+
+def test_a_full_disk_is_noticed_before_the_library_writes(
+    paths: Paths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a full disk, HDF5 prints tracebacks and crashes at the end of the process."""
+    full = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr("calibray.support.output_files.shutil.disk_usage", lambda _: full)
+    for write in (lambda: paths.save(tmp_path / "a.h5"), lambda: write_rays(paths, tmp_path / "rays.h5")):
+        with pytest.raises(InputError, match=r"cannot be written .*No space left"):
+            write()
+    assert not list(tmp_path.glob("*.h5*"))
 
 
 def test_materials_and_settings_keep_their_types(paths: Paths, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from calibray.materials import FIELDS, Material, check_frequency, constants_matr
 from calibray.paths import file_format
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.support.messages import first_line
-from calibray.support.output_files import as_path, check_file, exists, replacing
+from calibray.support.output_files import as_path, check_file, check_space, exists, replacing
 
 _WIDTH: Final = 80
 """Maximum length of a line in the summary [characters]."""
@@ -178,8 +178,10 @@ class Paths:
         target = check_file(path, overwrite=overwrite)
         try:
             with replacing(target, signed=False) as partial:
+                content = _content(self)
+                check_space(partial, sum(np.asarray(values).nbytes for values in content.arrays.values()))
                 with h5py.File(partial, "w", userblock_size=file_format.BLOCK) as file:
-                    file_format.write(file, _content(self))
+                    file_format.write(file, content)
                 digest = file_format.write_checksum(partial)
             file_format.remember(digest)
         except OSError as error:

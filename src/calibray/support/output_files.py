@@ -11,9 +11,11 @@ it into place in one step.
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import os
 import re
+import shutil
 import stat
 import time
 import uuid
@@ -252,6 +254,21 @@ def file_digest(file: Path) -> str:
 
 
 # Writing
+
+
+HDF5_METADATA: Final = 2**16  # generous size of an HDF5 file without its datasets [bytes]
+
+
+def check_space(partial: Path, size: int) -> None:
+    """Raise an error if an HDF5 file with datasets of a given size [bytes] does not fit on its disk.
+
+    On a full disk, the HDF5 library prints errors that cannot be caught, and may crash the process at its end.
+
+    Raises:
+        OSError: The disk has too little free space.
+    """
+    if shutil.disk_usage(partial.parent).free < size + HDF5_METADATA:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(partial))
 
 
 @contextmanager

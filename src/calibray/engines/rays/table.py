@@ -24,7 +24,7 @@ from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.paths import Kind
 from calibray.support.messages import did_you_mean, shortened
-from calibray.support.output_files import check_file, exists, replacing, write_table, write_text
+from calibray.support.output_files import check_file, check_space, exists, replacing, write_table, write_text
 from calibray.tracing.settings import RANGES
 
 TYPES: Final = {
@@ -416,11 +416,20 @@ def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = Fals
             finite = frame.replace(-np.inf, POWER_ZERO_DB)
             write_text(target, json.dumps({name: finite[name].tolist() for name in finite}) + "\n")
         case ".h5" | ".hdf5":
-            with replacing(target) as partial, h5py.File(partial, "w") as content:
-                for name in frame:
-                    column = frame[name].to_numpy()
-                    text = column.dtype.kind not in "iuf"
-                    content[str(name)] = np.array(column, dtype=h5py.string_dtype()) if text else column
+            try:
+                with replacing(target) as partial:
+                    check_space(partial, int(frame.memory_usage(deep=True).sum()))
+                    with h5py.File(partial, "w") as content:
+                        for name in frame:
+                            column = frame[name].to_numpy()
+                            text = column.dtype.kind not in "iuf"
+                            content[str(name)] = (
+                                np.array(column, dtype=h5py.string_dtype()) if text else column
+                            )
+            except OSError as error:
+                raise InputError(
+                    f"{target}: cannot be written ({error.strerror or error}); choose another folder"
+                ) from None
         case suffix:
             raise InputError(
                 f"{target}: cannot write {suffix or 'a file without extension'}; use .csv, .parquet, .json or .h5"
