@@ -443,3 +443,19 @@ def test_paths_without_a_calibrated_material_do_not_show_that_the_model_represen
     assert not mapped.understood
     text = remark_text(ray_mapping._remark(mapped))
     assert text.startswith("No path of the program meets a calibrated material")
+
+
+def test_a_candidate_that_is_asked_twice_is_one_call(foreign: Foreign) -> None:
+    """The minimum of the replay may be an earlier call, here the first."""
+    measured = foreign(foreign.problem.parameters.start).path_loss_db
+    problem = replace(foreign.problem, objective=replace(foreign.problem.objective, measured=measured))
+    asked = []
+
+    def export(candidate: np.ndarray) -> Export:
+        asked.append(candidate.tobytes())
+        return foreign(candidate)
+
+    engine = SimpleNamespace(export=export, hits=0)
+    _, trail, _ = ray_mapping.search_rays(problem, engine)  # pyright: ignore[reportArgumentType]
+    assert len(asked) > len(set(asked))
+    assert trail.rt_calls == len(trail.rmse_db) == len(set(asked))

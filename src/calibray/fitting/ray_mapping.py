@@ -157,6 +157,9 @@ def search_rays(
 
     def ask(candidate: NDArray[np.float64]) -> Export:
         export = engine.export(candidate)
+        # `engine` keeps its answers, so a repeated candidate is no further call.
+        if any(np.array_equal(candidate, earlier) for earlier in trail.candidates):
+            return export
         evaluation = problem.evaluate_candidates(candidate[None])
         number = len(trail.candidates) + 1
         trail.add(candidate[None], evaluation, number, time.perf_counter() - started)
@@ -166,7 +169,7 @@ def search_rays(
 
     mapped = map_rays(problem, ask, most_calls=most_calls, seed=method.seed)
     trail.minima = mapped.minima
-    trail.rt_calls, trail.ledger_hits = len(mapped.calls), engine.hits
+    trail.rt_calls, trail.ledger_hits = len(trail.candidates), engine.hits
     return with_engine(problem, mapped.engine), trail, _remark(mapped)
 
 
