@@ -222,8 +222,8 @@ class LinksSection(Section):
             the carrier of ``[scene]``.
         wide: Names of the transmitters by column, for a table with one column per transmitter.
         track: GPX track from which the columns `track_longitude` and `track_latitude` [deg] are added to the rows.
-        heights: "ground" for heights above the ground of the scene. If absent, heights are above z = 0 of the scene
-            frame.
+        heights: "ground" for heights above the ground of the scene. If absent, heights are above the vertical datum of
+            the scene frame.
         transmitters: Table with one row per transmitter, relative to the study file's folder.
         transmitter: Column with the name of the transmitter, in both tables.
         missing: Numbers that represent missing measurements, in addition to common codes such as 100 or -999.
