@@ -99,7 +99,7 @@ def test_a_scene_replaces_only_files_of_calibray(tmp_path, target):
         foreign.write_text("years of work")
     status, _, err = scene_command("plan", plan, "-o", out)
     assert status == 2
-    assert "is a link" in err if target == "meshes" else "give --overwrite" in err
+    assert "is a symbolic link" in err if target == "meshes" else "give --overwrite" in err
     assert not any((tmp_path / "elsewhere").iterdir()) if target == "meshes" else True
     written = [entry for entry in out.rglob("*") if entry.is_file()]
     assert written == ([] if target == "meshes" else [foreign])

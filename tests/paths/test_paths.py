@@ -399,7 +399,7 @@ def test_a_user_s_file_or_link_is_not_replaced(paths: Paths, tmp_path: Path) -> 
     paths.save(tmp_path / "paths.h5")
     assert Paths.load(tmp_path / "paths.h5") is not None
     (tmp_path / "link.h5").symlink_to(precious)
-    with pytest.raises(InputError, match="is a link"):
+    with pytest.raises(InputError, match="is a symbolic link"):
         paths.save(tmp_path / "link.h5", overwrite=True)
     with pytest.raises(InputError, match="was not written by Calibray"):
         paths.save(precious)

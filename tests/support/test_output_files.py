@@ -82,9 +82,9 @@ def test_inputs_links_and_devices_are_never_replaced(tmp_path, overwrite):
     for name, message in {
         "links.csv": "is an input; name another file",
         "hard.csv": "is an input; name another file",
-        "soft.csv": "is a link",
-        "dangling.csv": "is a link",
-        "null.csv": "is a link",
+        "soft.csv": "is a symbolic link",
+        "dangling.csv": "is a symbolic link",
+        "null.csv": "is a symbolic link",
         "fifo.csv": "is a folder, a device or a FIFO",
     }.items():
         with pytest.raises(InputError, match=message):

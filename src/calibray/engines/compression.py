@@ -144,7 +144,8 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
 def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
     """Training candidates, including corners of the bounds, followed by the candidates of each check [n, d].
 
-    A fit is least accurate where it extrapolates, so half of the candidates of a check are on faces of the bounds.
+    A fit is least accurate where it extrapolates. In half of the candidates of a check, each parameter is therefore at
+    one of its bounds with a probability of one half.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 

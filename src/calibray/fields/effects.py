@@ -184,7 +184,7 @@ class DisplacementLoss:
 
 
 def scaled(program: GroupedProgram, amplitude: jax.Array) -> GroupedProgram:
-    """The program with the field of each path, in the order of the program, multiplied by an amplitude [P]."""
+    """Multiply the field of each path by its amplitude [P], in the program's order of paths."""
     groups, first = [], 0
     for group in program.groups:
         own = amplitude[first : first + group.size].astype(group.rx.dtype)

@@ -97,7 +97,7 @@ class Objective:
 
     Attributes:
         measured: Measured path loss [L], [dB].
-        weight: Weights of the links; 0 leaves a link out [L].
+        weight: Weights of the links [L]; a link with weight 0 is left out.
         nuisance: The nuisance; may have no terms.
         ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error at the mean weight, which scales the priors [dB].

@@ -197,10 +197,11 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 
 
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
-    """The problem with the spreads of its random effects estimated at a point of the search space [d].
+    """Estimate the spreads of a problem's random effects at a point of the search space [d].
 
-    The second result is the standard deviation of a link's error within the groups of the last effect [dB]. On an
-    engine without derivatives, both are estimated at the initial values, for which path loss is known.
+    The first result is the problem with these spreads. The second result is the standard deviation of a link's error
+    within the groups of the last effect [dB]. On an engine without derivatives, both are estimated at the initial
+    values, for which path loss is known.
     """
     objective = problem.objective
     counted = np.flatnonzero(objective.weight > 0)

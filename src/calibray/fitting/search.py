@@ -265,7 +265,8 @@ def relevant_minima(
 ) -> NDArray[np.float64]:
     """Select the minima [k, d] that can contribute to an interval, lowest first [j, d].
 
-    Their mean squares are `square` [k]; `freedom` is the number of residuals minus that of unknowns.
+    `square` contains the mean squared residual at each minimum [k]; `freedom` is the number of residuals minus the
+    number of unknowns.
     """
     order = np.argsort(square, kind="stable")
     # (square - lowest) / lowest x freedom is the excess in noise variances.

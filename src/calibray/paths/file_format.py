@@ -1,4 +1,4 @@
-"""Content and seal of a path file. The shape, type and range of every dataset are checked when a file is read.
+"""Content and checksum of a path file. The shape, type and range of every dataset are checked when a file is read.
 
 The datasets are described in `docs/reference/path-file.md`.
 

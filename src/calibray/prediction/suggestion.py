@@ -275,7 +275,7 @@ class _ReplayedDraws:
         return loss, slope * (self.problem.parameters.search_slope(self.values) * self.width)[:, None, :]
 
     def _information(self, evaluation: Evaluation) -> NDArray[np.float64]:
-        """Information matrix of the links in the unit cube [m, d, d]."""
+        """Fisher information of the links about the parameters in the unit cube, at every evaluated point [m, d, d]."""
         slopes = evaluation.slopes * self.width / self.noise_db
         return np.einsum("nmi,nmj->nij", slopes, slopes)
 

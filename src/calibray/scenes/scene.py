@@ -451,7 +451,7 @@ def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) ->
         number += 1
         name = f"{stem}-{number}{mesh.suffix}"
     if folder.is_symlink():
-        raise InputError(f"{folder}: is a link; remove it, or export into another folder")
+        raise InputError(f"{folder}: is a symbolic link; remove it, or export to another folder")
     if (folder / name).exists() and (folder / name).samefile(mesh):
         return mesh
     check_outputs(folder, [name], [mesh], overwrite)

@@ -303,7 +303,7 @@ def write_scene(
     # Meshes in another folder must not be replaced through a link.
     if (folder / MESHES).is_symlink():
         raise InputError(
-            f"output folder {folder}: {folder / MESHES} is a link; remove it, or name another folder"
+            f"output folder {folder}: {folder / MESHES} is a symbolic link; remove it, or choose another folder"
         )
     check_outputs(folder / MESHES, list(meshes), overwrite=overwrite)
     (folder / MESHES).mkdir(parents=True, exist_ok=True)

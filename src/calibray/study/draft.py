@@ -105,7 +105,7 @@ def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
 
 
 def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
-    """The columns of labels that group the offset."""
+    """The columns whose labels define the groups of the offset."""
     if value.quantity != "rsrp":
         draft.assume("offset", "one for all links", "the values include cables and unknown antenna gains")
         return []

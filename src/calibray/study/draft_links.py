@@ -103,7 +103,7 @@ class LinksDraft:
         sites: The table of transmitters, limited to those of the links; None without such a table.
         rx: Columns of the receivers' positions.
         tx: Columns of the transmitters' positions; None if there are no such columns.
-        groups: The columns of labels that group the offset.
+        groups: The columns whose labels define the groups of the offset.
         observables: The sections of ``[observables]``.
     """
 

@@ -241,7 +241,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def offset_groups(self) -> tuple[str, ...]:
-        """The columns of labels that group the offset; empty for a single offset or without an offset."""
+        """The columns whose labels define the groups of the offset; empty for a single offset or without an offset."""
         return () if self.offset is None else self.offset.term().per
 
     @property

@@ -128,7 +128,9 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
     if status is None:
         return
     if stat.S_ISLNK(status.st_mode):
-        raise InputError(f"output file {file}: is a link; give the file to which it points, or another file")
+        raise InputError(
+            f"output file {file}: is a symbolic link; give the file to which it points, or another file"
+        )
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"output file {file}: is a folder, a device or a FIFO; give a file")
     for source in inputs:

@@ -174,9 +174,11 @@ def select() -> Llvm:
         if not library.usable:
             best = next((other.path for other in installed_libraries() if other.usable), None)
             remedy = (
-                f"use {best}" if best else f"let Calibray search, after installing one: {install_command()}"
+                f"Unset it to use {best}"
+                if best
+                else f"Install libLLVM ({install_command()}), and unset the variable"
             )
-            raise InputError(f"{PATH_VARIABLE}={requested}: {library.problem}. Unset it to {remedy}")
+            raise InputError(f"{PATH_VARIABLE}={requested}: {library.problem}. {remedy}")
     else:
         libraries = installed_libraries()
         if not libraries or not libraries[0].usable:

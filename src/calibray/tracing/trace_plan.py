@@ -37,7 +37,7 @@ ADAPTIVE_SECONDS: Final = 3.0
 SMALL_LAUNCH: Final = 5_000_000
 """Largest number of lanes of a small launch, which finds at most a few thousand candidates and takes at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
-"""Distance below which interaction points count as equal [m]; points of different paths are seldom so close."""
+"""Side of the grid cells that compare interaction points [m]; points of different paths are seldom so close."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The joint model of all unknowns: parameters, fixed constants, buildings and errors.
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
-- Constants of these materials that come from the scene, such as thickness, have a log-normal prior around the scene's
-  value, because they are never known exactly. A scattering coefficient of 0 is exact with a probability of one half.
+- Constants that the scene fixes for the calibrated materials, such as thickness, are never known exactly. They have a
+  log-normal prior around the scene's value. A scattering coefficient of 0 is exact with a probability of one half.
 - A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
   between-building spread s is zero with probability `ALIKE`, and otherwise exponentially distributed.
 - Errors follow one of several noise models (`noise_models.py`). The noise level, the nuisances and an undeclared offset
@@ -163,7 +163,7 @@ class JointModel:
         return self.marginal.densities(links) + further[:, None]
 
     def _split(self, gaps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gaps of path loss [n, m], and the log likelihood of the further observables [n].
+        """Weighted differences of path loss [n, m], and the log likelihood of the further observables [n].
 
         If the study does not state an observable's error, the error is integrated out, with a prior inversely
         proportional to the error.

@@ -16,8 +16,8 @@ Harville, Biometrika 61, 1974): with whitened errors y and design Z, ridge R, A 
 where f is the number of links minus the number of columns with a flat prior. For heavy tails, both integrals use
 Laplace's approximation (`laplace.py`).
 
-Paths that the twin lacks, such as paths through buildings, add power. They hardly change the power of links in sight.
-Out of sight, the twin underestimates the power by their contribution.
+Paths that the twin lacks, such as paths through buildings, add power. They hardly change the power of line-of-sight
+links. Out of sight, the twin underestimates the power by their contribution.
 """
 
 from __future__ import annotations

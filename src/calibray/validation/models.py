@@ -50,7 +50,7 @@ OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
 20 dB at 100 m. If all fitted links are in sight, only the prior contains information about this loss."""
 
 WALL_DB: Final = 2.0
-"""Standard deviation of the prior of the loss per wall crossed, around zero [dB]. Indoors, the loss of walls dominates
+"""Standard deviation of the zero-mean prior for the loss per wall crossed [dB]. Indoors, the loss of walls dominates
 with any prior. Outdoors, waves travel around buildings; with 5 dB, the error on one held-out cluster of Boulder was 17
 dB."""
 

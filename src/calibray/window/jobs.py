@@ -85,7 +85,7 @@ class Jobs:
         if running := self.running():
             raise InputError(f"{running.command}: is running; wait until it ends, or stop it")
         if self._folder.is_symlink():
-            raise InputError(f"{self._folder}: is a link; remove it")
+            raise InputError(f"{self._folder}: is a symbolic link; remove it")
         try:
             self._folder.mkdir(exist_ok=True)
             # All files are considered, because a command that was never recorded may have left its log.
