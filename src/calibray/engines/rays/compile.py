@@ -107,7 +107,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
         # In a null of the antennas, a path may have no power in replay, and only a rounding error in the engine.
-        kept = np.flatnonzero((powers(paths) > 0) | (table.power > ROUNDING * _free_space(paths)))
+        kept = np.flatnonzero((_replayed(paths) > 0) | (table.power > ROUNDING * _free_space(paths)))
         power, table, paths = table.power[kept], table.take(kept), take(paths, kept)
         _check_direct(table, paths, power, setting.antennas is not None)
         paths = replace(paths, correction=_correction(table, paths, power))
@@ -147,6 +147,12 @@ def powers(paths: Paths) -> NDArray[np.float64]:
     """Power gain of every path, summed over receive ports and averaged over transmit ports [P]."""
     gain = path_gains(paths).reshape(paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1])
     return (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
+
+
+def _replayed(paths: Paths) -> NDArray[np.float64]:
+    """The same power, but 0 in a null of an antenna, where it is a rounding error [P]."""
+    gain = [(np.abs(field) ** 2).sum(axis=2).max(axis=1) for field in (paths.tx_field, paths.rx_field)]
+    return np.where(np.minimum(*gain) > ROUNDING, powers(paths), 0.0)
 
 
 def _free_space(paths: Paths) -> NDArray[np.float64]:
@@ -326,7 +332,9 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
     free_space = _free_space(paths)
     replayed, least = powers(paths) if known else free_space, ROUNDING * free_space
     off = 10 * np.log10(np.maximum(power, least) / np.maximum(replayed, least))
-    wrong = direct & (np.abs(off) > FREE_SPACE_DB if known else off > DIRECT_GAIN_DB)
+    # In a null, no correction can restore the power.
+    implausible = (np.abs(off) > FREE_SPACE_DB) | (_replayed(paths) == 0) if known else off > DIRECT_GAIN_DB
+    wrong = direct & implausible
     if wrong.any():
         worst = int(np.argmax(np.where(wrong, np.abs(off), 0)))
         side = "above" if off[worst] > 0 else "below"
@@ -348,7 +356,7 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
 
 
 def _correction(table: RayTable, paths: Paths, power: NDArray[np.float64]) -> NDArray[np.float64]:
-    replayed = powers(paths)
+    replayed = _replayed(paths)
     if not (replayed > 0).all():
         material = list(paths.materials)[paths.material[paths.first[int(np.argmin(replayed))]]]
         raise InputError(
