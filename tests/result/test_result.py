@@ -194,7 +194,7 @@ def edited(folder, **changes):
     ("changes", "message"),
     [
         ({"fit__materials": {}}, "materials: 'concrete' is missing"),
-        ({"nuisance__coefficients": {}}, "nuisance.coefficients: must have the terms"),
+        ({"nuisance__coefficients": {}}, "nuisance.coefficients: must contain the terms"),
         ({"fit__rmse_db": float("nan")}, r"rmse_db = nan: must be a finite number"),
         ({"fit__rmse_db": "1.5"}, r"rmse_db = '1.5': must be a number"),
         ({"fit__rmse_db": -1.0}, r"rmse_db = -1.0: must be at least 0"),
