@@ -340,6 +340,24 @@ def test_a_null_of_the_antennas_has_the_power_of_a_rounding_error(yard: Tracer, 
             )
 
 
+def test_every_diffraction_of_a_path_has_its_own_edge(tmp_path: Path) -> None:
+    """Over the roofs of two houses, as in exports of Wireless InSite; each edge is the source for the next."""
+    houses = {"low": block((-5, -5, 0), (0, 5, 8)), "high": block((10, -5, 0), (15, 5, 9))}
+    scene = read_scene(write_scene(tmp_path, houses), FREQUENCY)
+    stops = np.array([[-20.0, 0, 12], [0, 0, 8], [10, 0, 9], [30, 0, 9.5]])
+    kinds = ["transmitter", "diffraction", "diffraction", "receiver"]
+    rows = pd.DataFrame(stops, columns=list("xyz")).assign(path=1, point=range(4), type=kinds)
+    paths = cb.read_rays(rows, scene, frequency=FREQUENCY, antennas=(Antenna(), Antenna()))
+    table, (a, b, c) = paths.diffraction, np.linalg.norm(np.diff(stops, axis=0), axis=1)
+    np.testing.assert_allclose(table.exterior_angle, 1.5 * np.pi)
+    np.testing.assert_allclose(table.distance, [a * b / (a + b), (a + b) * c / (a + b + c)])
+    # The angles of both rays with the lit face: the roof of the low house, the wall of the high one.
+    np.testing.assert_allclose(table.azimuth_in, [np.arctan2(4, 20), np.arctan2(10, 1)])
+    # A wave of amplitude 1 / a that every edge spreads by sqrt(s' / (s (s' + s))).
+    spreading = np.sqrt(a / (b * (a + b))) * np.sqrt((a + b) / (c * (a + b + c))) / a
+    np.testing.assert_allclose(paths.spreading, spreading)
+
+
 def direct_paths(labels: list[str]) -> pd.DataFrame:
     """Direct paths of 1, 2, 3, ... m, one for each link, with their power in free space."""
     number = np.repeat(np.arange(1, len(labels) + 1), 2)

@@ -36,6 +36,9 @@ class Chains:
         edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
         normal_n: Normal of the wedge's n-face [P, 3]; empty [0, 3] without diffraction.
         edge_lengths: Path lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
+
+    If paths have several diffractions, these three arrays have one more axis [P, D, ...]; s is then the distance to the
+    next edge.
     """
 
     source: NDArray[np.float64]
@@ -111,7 +114,7 @@ def compile_chains(chains: Chains) -> Geometry:
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     # Path length up to the start of the ray tube; a diffuse reflection starts a new ray tube.
     tube_start = np.zeros(count)
-    # 1/sqrt(s s' (s + s')) where an edge diffracts, else 0
+    # 1/sqrt(s s' (s + s')) where one edge diffracts, else 0
     spread = np.zeros(count)
     travelled = segment[:, 0].copy()
     for step in range(depth):
@@ -148,11 +151,15 @@ def compile_chains(chains: Chains) -> Geometry:
         wedge = kind == Kind.DIFFRACTION
         if wedge.any():
             rows, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
-            edge, (before, after) = chains.edge[rows], chains.edge_lengths[rows].T
-            spread[rows] = 1 / np.sqrt(before * after * (before + after))
-            constants = _wedge(
-                k_in, k_out, normal[wedge], chains.normal_n[rows], edge, before * after / (before + after)
+            edge, normal_n, lengths = (
+                values[rows] if values.ndim == 2 else values[rows, step]
+                for values in (chains.edge, chains.normal_n, chains.edge_lengths)
             )
+            before, after = lengths.T
+            # An edge multiplies the amplitude by sqrt(s' / (s (s' + s))); it is 1/s' at the first edge.
+            arriving = np.where(spread[rows] > 0, spread[rows], 1 / before)
+            spread[rows] = arriving * np.sqrt(before / (after * (before + after)))
+            constants = _wedge(k_in, k_out, normal[wedge], normal_n, edge, before * after / (before + after))
             tables[Kind.DIFFRACTION].append((rows, np.full(len(rows), step), *constants))
             # Edge-fixed frames: the first axes are k_in x e and -(k_out x e).
             entering[wedge] = _unit(_cross(k_in, edge))

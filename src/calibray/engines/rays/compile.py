@@ -194,15 +194,18 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
     face, distance = match(surfaces, hits, names)
     normal = np.zeros((*table.kind.shape, 3))
     normal[present] = surfaces.normal[face]
-    edge, normal_n, lengths = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
-    if hits.diffracts.any():
-        edge, normal_n, lengths = (np.zeros((len(stops), width)) for width in (3, 3, 2))
+    edge, normal_n, lengths = (np.zeros((*table.kind.shape, width)) for width in (3, 3, 2))
     for number in np.flatnonzero(hits.diffracts).tolist():
         path, at = row[number], step[number]
         found = find_edge(surfaces, hits, number)
         face[number], normal[path, at] = found.face, found.normal_0
-        edge[path], normal_n[path] = found.direction, found.normal_n
-        lengths[path] = segment[path, : at + 1].sum(), segment[path, at + 1 :].sum()
+        edge[path, at], normal_n[path, at] = found.direction, found.normal_n
+        # The next edge, or the receiver.
+        onward = np.append(table.kind[path, at + 1 :] == Kind.DIFFRACTION, True)
+        lengths[path, at] = (
+            segment[path, : at + 1].sum(),
+            segment[path, at + 1 :][: np.argmax(onward) + 1].sum(),
+        )
     _check_delays(table, segment)
     material = np.zeros(table.kind.shape, dtype=np.int64)
     material[present] = surfaces.material[face]
