@@ -242,6 +242,19 @@ def test_predictions_at_new_links_are_answers_of_the_program(tmp_path):
         result.predict(new)
 
 
+@pytest.mark.parametrize(("away", "worse"), [(0.1, True), (3.5, False)])
+def test_a_result_that_is_worse_than_the_initial_values_says_so(tmp_path, away, worse):
+    """Two random candidates come nearer to the planted values than initial values far away, and not than near ones."""
+    content = programs.content(tmp_path) | {"method": {"name": "random", "options": {"budget": 2}}}
+    for name, value in zip(planted.TRUTH, programs.TRUTH + away, strict=True):
+        content["parameters"][name] = {"bounds": planted.BOUNDS, "start": float(value)}
+    result = calibrate(Study.from_content(content, tmp_path / "study.toml"))
+    assert (result.rmse_db > result.initial_rmse_db) == worse
+    remarks = [text for text in result.remarks if "did not improve on the initial values" in text]
+    assert len(remarks) == worse
+    assert all(f"an RMSE of {result.initial_rmse_db:.2f} dB" in text for text in remarks)
+
+
 def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     """It answers 8 calls and then never again; mended, it goes on from there."""
     content = programs.content(tmp_path, "if earlier > 8: sys.exit('the licence ran out')", give_up_after=4)

@@ -58,6 +58,9 @@ from calibray.validation.choice import fit_prediction_model
 from calibray.validation.models import log_distance, without_scene
 from calibray.validation.validation import Validation
 
+WORSE_DB: Final = 0.05
+"""Smallest increase of RMSE over that of the initial values which a remark reports [dB]."""
+
 FAINT: Final = "predicted too near the noise floor, left out"
 """Label, in the row counts, of links that the model predicts near the noise floor."""
 
@@ -171,6 +174,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
                 *run.on_links,
+                *_worse_than_start(problem, trail, nuisance_only if fitted else models.initial),
                 *certainty.record.remarks,
                 *_retraced(gap_db, counted, study.fidelity.tolerance_db),
                 *_not_judged(study, accuracy),
@@ -213,6 +217,23 @@ def _retraced(
         "largest_db": largest_gap(gap_db, counted) or 0.0,
     }
     return (Remark(RemarkKind.RETRACED, values),)
+
+
+def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float64]) -> tuple[Remark, ...]:
+    """A remark if the initial values, with path loss `start_db` [L], fit better than the method's best candidate.
+
+    With priors or further observables, the method minimises more than the RMSE of path loss, so there is no remark.
+    """
+    study = problem.setup.study
+    priors = [entry.prior for entry in (*study.parameters.values(), *study.nuisance_terms.values())]
+    start = rmse_of(problem, start_db, problem.objective.weight > 0)
+    if (
+        study.observables
+        or any(prior is not None for prior in priors)
+        or not trail.best_rmse_db > start + WORSE_DB
+    ):
+        return ()
+    return (Remark(RemarkKind.WORSE_THAN_START, {"start_db": start, "found_db": trail.best_rmse_db}),)
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:

@@ -367,6 +367,11 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
         f"method reached {values['found_db']:.2f} dB. The intervals describe the optimum, not the values that were "
         "found. Use the method 'auto', or a larger budget."
     ),
+    RemarkKind.WORSE_THAN_START: lambda values: (
+        f"The method did not improve on the initial values: they have an RMSE of {values['start_db']:.2f} dB, and the "
+        f"best candidate of the method has {values['found_db']:.2f} dB. Do not use the result. Use a larger budget "
+        "(method.options), or the method 'auto'."
+    ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
         "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing, so "
