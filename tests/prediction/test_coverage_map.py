@@ -300,6 +300,14 @@ def test_impossible_arguments_are_refused_before_tracing(result, monkeypatch, ar
         cb.coverage_map(result, **{"tx": TX, "columns": WEST, "cell": 50.0, **arguments})
 
 
+def test_the_option_in_a_message_can_be_pasted_into_a_terminal(result):
+    content = result.study.content()
+    content["offset"]["per"] = "freq [GHz]"
+    study = cb.Study.from_content(content, result.study.path)
+    with pytest.raises(InputError, match=re.escape("--column 'freq [GHz]=VALUE'")):
+        cb.coverage_map(changed(result, study=study), TX, cell=50.0)
+
+
 def test_receivers_are_on_the_lowest_ground():
     """A slope z = 0.1 x + 0.2 y, a slab over all of it, and an area outside both."""
     corners = np.array([(0, 0), (10, 0), (10, 10), (0, 10)], dtype=float)

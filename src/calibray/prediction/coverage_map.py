@@ -8,6 +8,7 @@ more than 0.7 dB in 10 % of them (`python benchmarks/coverage_map.py --solver`).
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
@@ -198,7 +199,7 @@ def _column_values(
         if name not in values:
             raise InputError(
                 f"{study.path}: the map needs the links' column {name!r}; give its value for this transmitter: "
-                f"--column {name}=VALUE (columns={{{name!r}: value}})"
+                f"--column {shlex.quote(f'{name}=VALUE')} (columns={{{name!r}: value}})"
             )
     if unknown := [name for name in columns if name not in needed]:
         known = [str(name) for name in study.measurements().frame]
