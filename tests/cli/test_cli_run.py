@@ -21,7 +21,7 @@ from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.reporting import result_tables
 from calibray.result.files import FILES
-from calibray.support.output_files import SIGNATURES
+from calibray.support.output_files import SIGNATURES, write_text
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
 from changed import changed
@@ -121,7 +121,11 @@ def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeyp
     assert len(programs.calls(tmp_path)) == 19  # with the values before calibration
     parameters = Result.load(tmp_path / "out").parameters
     assert list(parameters.values()) == pytest.approx(programs.TRUTH, abs=0.5)
-    assert run(*arguments).exit_code == 0
+    assert "map" not in first.stderr
+    write_text(tmp_path / "out" / "map.csv", "of the first run")
+    second = run(*arguments)
+    assert second.exit_code == 0
+    assert f"the map in {tmp_path / 'out'} (map.csv) is that of an earlier run" in second.stderr
     assert len(programs.calls(tmp_path)) == 19
     assert Result.load(tmp_path / "out").parameters == parameters
     listed = run("ledger", tmp_path / "out")

@@ -121,7 +121,23 @@ def run(
     names = [*FILES, *_write_report(result, out, output)]
     judge = result.accuracy.judgement is None and result.study.allows_blocks
     following = command("validate", study_file, "--out", out) if judge else command("predict", out, "LINKS")
+    if note := _earlier_map_text(out):
+        echo(note, err=True)
     echo(f"Written to {out}: {', '.join(names)}; next: {following}", err=True)
+
+
+def _earlier_map_text(out: Path) -> str:
+    """A note if the folder contains a map, which is that of an earlier calibration; empty if it contains none."""
+    from calibray.prediction.map_files import FILES
+    from calibray.support.output_files import is_unchanged_output
+
+    files = [name for name in FILES if (out / name).is_file() and is_unchanged_output(out / name)]
+    if not files:
+        return ""
+    return (
+        f"Note: the map in {out} ({', '.join(files)}) is that of an earlier run; draw it again with: "
+        + command("map", out)
+    )
 
 
 def _kept_text(out: Path) -> str:
