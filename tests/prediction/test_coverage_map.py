@@ -300,6 +300,23 @@ def test_impossible_arguments_are_refused_before_tracing(result, monkeypatch, ar
         cb.coverage_map(result, **{"tx": TX, "columns": WEST, "cell": 50.0, **arguments})
 
 
+def test_clusters_of_one_term_are_those_of_all_terms(result, monkeypatch):
+    """The side of the squares is stated once, so no term needs a column of clusters."""
+
+    def traced(*_, **__):
+        raise InterruptedError
+
+    monkeypatch.setattr(cb.Setup, "trace", traced)
+    content, term = result.study.content(), {"per": "cluster", "prior": "auto"}
+    content["nuisance"] = {
+        "a": term | {"by": "constant", "cluster_m": 30.0},
+        "b": term | {"by": "log_distance"},
+    }
+    study = cb.Study.from_content(content, result.study.path)
+    with pytest.raises(InterruptedError):
+        cb.coverage_map(changed(result, study=study), TX, cell=30.0, bounds=AREA, columns=WEST)
+
+
 def test_the_option_in_a_message_can_be_pasted_into_a_terminal(result):
     content = result.study.content()
     content["offset"]["per"] = "freq [GHz]"

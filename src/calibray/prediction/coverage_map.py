@@ -31,6 +31,7 @@ from calibray.result.held_out import NEW_GROUP, NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.scenes.checks.positions import INSIDE, locate
+from calibray.scenes.obstruction import CLUSTER
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Study
 from calibray.study.mounting import mounting_columns
@@ -190,7 +191,8 @@ def _column_values(
             values[groups[0]] = labels.pop()
     needed = [*groups]
     for section in study.nuisance.values():
-        needed += [section.per] if section.per is not None and section.cluster_m is None else []
+        by_squares = section.per == CLUSTER and study.cluster_m is not None
+        needed += [section.per] if section.per is not None and not by_squares else []
         needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE, *OBSTRUCTION) else []
     of_links = [*mounting_columns(study), *([study.links.frequency] if study.links.frequency else [])]
     values |= _measured_values(study, tx, of_links, values)
