@@ -146,6 +146,8 @@ def test_a_sector_that_points_elsewhere_than_stated_is_named(
         if name != "omni":
             stated = 90.0 - turned if name == "east" else 0.0
             assert np.degrees(angle[np.argmax(level)]) % 360 == pytest.approx(stated)
+    moved = result.links["rx_x"] + 1.0
+    assert residuals_by_direction(replace(result, links=result.links.assign(rx_x=moved))) is None
     if not turned:
         assert not remarks
         return

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.prediction.predict import has_links
 from calibray.reporting.diagnostics import diagnostics
 from calibray.reporting.link_survey import residual
 from calibray.result.record import Record
@@ -200,7 +201,8 @@ def by_depth(table: pd.DataFrame) -> Figure:
 def residuals_by_direction(result: Record) -> Figure | None:
     """Draw the residuals of links versus direction from their transmitter, with its antenna pattern on the horizon.
 
-    The result is None if the study does not state the mounting of transmitters, or its links cannot be read.
+    The result is None if the study does not state the mounting of transmitters, or its links cannot be read or have
+    changed.
     """
     study = result.study
     if "tx" not in study.links.mountings:
@@ -210,7 +212,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
         mounting = link_mountings(study, links)["tx"]
     except InputError:
         return None
-    if links.row.tolist() != result.links["row"].tolist():
+    if not has_links(result, links):
         return None
     # Predicted minus measured path loss: outer points received more power than predicted.
     residuals = residual(result.links, sign=1)

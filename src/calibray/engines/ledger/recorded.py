@@ -103,8 +103,9 @@ class Recorded:
         elif failures and not self._warned:
             self._warned = True
             _LOG.warning(
-                "an RT call failed, so all its links are treated as links without a path; list failed calls with %s. "
-                "The failed call: %s", command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
+                "an RT call failed, so all its links are treated as links without a path; list failed calls with %s, "
+                "or add --forget-failed to delete them, so that the next run repeats them. The failed call: %s",
+                command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
             )  # fmt: skip
         return answers, first
 
