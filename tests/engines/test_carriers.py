@@ -443,7 +443,7 @@ def test_a_law_that_leaves_physics_at_a_carrier_is_refused_with_it(folder: Path)
 
 
 def test_a_material_whose_law_does_not_reach_a_carrier_is_named(folder: Path) -> None:
-    with pytest.raises(InputError, match="'wet_ground' for 1 to 10 GHz, not for 28 GHz: give relative_perm"):
+    with pytest.raises(InputError, match="'wet_ground' at 1 to 10 GHz, not at 28 GHz: give relative_perm"):
         engines.make(study(folder, materials={"soil": {"itu": "wet_ground"}}))
 
 

@@ -79,7 +79,7 @@ def test_a_start_has_no_effect_on_a_method_that_takes_none(name):
         ({"name": "gwoo"}, "method 'gwoo': there is no such method; did you mean 'gwo'"),
         (
             {"name": "gwo", "options": {"wolfes": 3}},
-            "method.options of 'gwo': there is no setting 'wolfes'; there are",
+            "method.options of 'gwo': there is no setting 'wolfes'; use one of: iterations",
         ),
         ({"name": "gwo", "options": {"iteration": 3}}, "setting 'iteration'; did you mean 'iterations'"),
         ({"name": "gwo", "options": {"seed": 3}}, "there is no setting 'seed'"),

@@ -128,7 +128,7 @@ def test_pieces_outside_the_judged_set_are_reported():
     assert verdict.name == "identified"
     assert len(verdict.pieces) == 2
     found = re.fullmatch(
-        r"90 % .* range; the 95 % interval also includes (\S+) to (\S+) \((\d) % of it\)",
+        r"90 % .* range; the 95 % interval also includes (\S+) to (\S+) \((\d) % of the posterior\)",
         reason_text(verdict.reason),
     )
     assert found is not None
