@@ -12,8 +12,8 @@ The table shows, by verdict, how often 90 % sets contain the truth. It also show
 has a warning, or a value at a bound, which the report explains as a possible defect of the model. A verdict is wrong if
 it is not "not identifiable" and the 95 % interval misses the truth. The regret is the RMSE at the cluster kept apart of
 the model that held-out blocks choose, minus that of the best of the initial materials, the calibrated ones and the
-log-distance model. The same is shown for the choice without averaging, and for the calibrated models without and with a
-prior.
+log-distance model. The same is shown for the choice without averaging, for the calibrated models without and with a
+prior, and for the average of these two.
 """
 
 from __future__ import annotations
@@ -130,9 +130,10 @@ def table(lines: list[dict[str, Any]]) -> Table:
         numbers("identified"), numbers("in 90 % set"), numbers("ambiguous or at bound"), numbers("in 90 % set"),
         numbers("all, in 90 % set"), numbers("wrong runs"), numbers("of these warned"), numbers("warned or at bound"),
         numbers("all runs, warned"), numbers("choice right"), numbers("regret", "dB"), numbers("not averaged", "dB"),
-        numbers("calibrated", "dB"), numbers("with prior", "dB"), numbers("CPU", "s"),
+        numbers("calibrated", "dB"), numbers("with prior", "dB"), numbers("their average", "dB"),
+        numbers(f"at most {NEARLY_DB} dB"), numbers("CPU", "s"),
     )  # fmt: skip
-    rows = []
+    rows, average = [], Model.AVERAGE_CALIBRATED
     for world in (*dict.fromkeys(line["world"] for line in lines), "all"):
         mine = [line for line in lines if world in (line["world"], "all")]
         values = [each for line in mine for each in zip(line["verdicts"], line["inside"], strict=True)]
@@ -149,7 +150,7 @@ def table(lines: list[dict[str, Any]]) -> Table:
         regret = [_regret(line, line["chosen"]) for line in choices]
         rivals = [
             [_regret(line, NOT_AVERAGED.get(line["chosen"], line["chosen"])) for line in choices],
-            *([_regret(line, name) for line in choices] for name in (Model.CALIBRATED, Model.PRIOR)),
+            *([_regret(line, name) for line in choices] for name in (Model.CALIBRATED, Model.PRIOR, average)),
         ]
         rows.append((
             world, str(len(mine)), *cells, _share([held for _, held in values]), str(len(wrong)),
@@ -158,6 +159,7 @@ def table(lines: list[dict[str, Any]]) -> Table:
             _share([bool(line["remarks"]) for line in mine]),
             _share([loss <= NEARLY_DB for loss in regret]),
             *(f"{np.mean(each):.2f}" if each else "-" for each in (regret, *rivals)),
+            _share([loss <= NEARLY_DB for loss in rivals[-1]]),
             f"{np.mean([line['seconds'] for line in mine]):.1f}",
         ))  # fmt: skip
     return Table("Where the truth has what the scene lacks", columns, tuple(rows))

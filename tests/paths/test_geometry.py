@@ -66,9 +66,6 @@ def random_chains(seed: int) -> Chains:
         material=np.zeros_like(kind),
         probability=np.where(kind > 0, random.uniform(0.2, 1, kind.shape), 1.0),
         samples=SAMPLES,
-        edge=np.zeros((0, 3)),
-        normal_n=np.zeros((0, 3)),
-        edge_lengths=np.zeros((0, 2)),
     )
 
 
@@ -236,9 +233,9 @@ def test_angles_of_a_wedge_equal_those_of_its_construction(
         material=np.zeros((1, 1), dtype=int),
         probability=np.ones((1, 1)),
         samples=SAMPLES,
-        edge=placed[4],  # n_0 x edge points along the 0-face, away from the edge
-        normal_n=placed[3],
-        edge_lengths=np.array([[before, after]]) / sine,
+        edge=placed[4][None],  # n_0 x edge points along the 0-face, away from the edge
+        normal_n=placed[3][None],
+        edge_lengths=np.array([[[before, after]]]) / sine,
     )
     geometry = compile_chains(chains)
     wedge = geometry.diffraction

@@ -93,7 +93,7 @@ def _check_same_inputs(setup: Setup, folder: Path) -> None:
         InputError: A file of the scene or an antenna, or the links have changed since the calibration.
     """
     from calibray.calibration.result import Result
-    from calibray.prediction.predict import changed_files, has_links
+    from calibray.result.files import changed_files, has_links
 
     result = Result.load(folder, allow_changed_inputs=True)
     changed = changed_files(result, setup.files)

@@ -33,12 +33,10 @@ class Chains:
         material: Index of the material of every interaction [P, D].
         probability: Probability with which the tracer chose the kind of interaction [P, D].
         samples: Number of rays launched per source.
-        edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
-        normal_n: Normal of the wedge's n-face [P, 3]; empty [0, 3] without diffraction.
-        edge_lengths: Path lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
-
-    If paths have several diffractions, these three arrays have one more axis [P, D, ...]; s is then the distance to the
-    next edge.
+        edge: Directions of the diffracting edges [P, D, 3], read only at diffractions; empty without diffraction.
+        normal_n: Normals of the n-faces of the wedges [P, D, 3], in the same way.
+        edge_lengths: Path lengths s' from the source to an edge, and s from this edge to the next one or to the target
+            [P, D, 2], [m], in the same way.
     """
 
     source: NDArray[np.float64]
@@ -49,9 +47,9 @@ class Chains:
     material: NDArray[np.integer]
     probability: NDArray[np.float64]
     samples: int = 1
-    edge: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    normal_n: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    edge_lengths: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    edge: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    normal_n: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    edge_lengths: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 2)))
 
 
 @dataclass(frozen=True)
@@ -151,11 +149,8 @@ def compile_chains(chains: Chains) -> Geometry:
         wedge = kind == Kind.DIFFRACTION
         if wedge.any():
             rows, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
-            edge, normal_n, lengths = (
-                values[rows] if values.ndim == 2 else values[rows, step]
-                for values in (chains.edge, chains.normal_n, chains.edge_lengths)
-            )
-            before, after = lengths.T
+            edge, normal_n = chains.edge[rows, step], chains.normal_n[rows, step]
+            before, after = chains.edge_lengths[rows, step].T
             # An edge multiplies the amplitude by sqrt(s' / (s (s' + s))); it is 1/s' at the first edge.
             arriving = np.where(spread[rows] > 0, spread[rows], 1 / before)
             spread[rows] = arriving * np.sqrt(before / (after * (before + after)))

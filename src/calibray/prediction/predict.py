@@ -6,7 +6,6 @@ import logging
 from collections.abc import Container, Mapping
 from dataclasses import replace
 from numbers import Real
-from pathlib import Path
 from typing import Final, cast
 
 import numpy as np
@@ -29,6 +28,7 @@ from calibray.prediction.corrections import (
     nuisance_shift,
 )
 from calibray.prediction.observables import Replayed, as_measured, further_observables
+from calibray.result.files import changed_files
 from calibray.result.held_out import AVERAGES, NEW_GROUP, Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
@@ -443,31 +443,6 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
             f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may be invalid for "
             "the changed file; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
         )
-
-
-def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
-    """Names of the files of the scene and antennas that have changed since the calibration.
-
-    `files` are the current files with their digests, as `Setup.files`.
-    """
-    if not result.provenance.files:
-        return []
-    # Files are compared by name and content, because the whole folder may have moved.
-    calibrated, current = (
-        sorted((Path(file).name, digest) for file, digest in files.items())
-        for files in (result.provenance.files, files)
-    )
-    return sorted({name for name, _ in set(calibrated) ^ set(current)})
-
-
-def has_links(result: Record, links: Measurements) -> bool:
-    """Whether a calibration has these links, with their measured values and positions, within rounding in files."""
-    table, ends = result.links, result.ends
-    pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
-    pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]
-    return len(table) == len(links) and all(
-        np.allclose(calibrated, current, rtol=1e-8, atol=1e-3) for calibrated, current in pairs
-    )
 
 
 def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:

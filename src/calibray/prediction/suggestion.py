@@ -32,12 +32,12 @@ from calibray.prediction.predict import (
     NEIGHBOURS,
     as_links,
     check_inputs,
-    has_links,
     refuse_far_links,
     traced_materials,
     warn_of_carriers,
     with_constants,
 )
+from calibray.result.files import has_links
 from calibray.result.record import Record
 from calibray.scenes import read_triangles
 from calibray.study import Setup

@@ -16,9 +16,9 @@ import pandas as pd
 from calibray.errors import InputError
 from calibray.materials import FIELDS
 from calibray.measurements import position_columns
-from calibray.prediction.predict import changed_files
 from calibray.reporting.link_survey import Survey, survey
 from calibray.reporting.wording import scene_alone_text
+from calibray.result.files import changed_files
 from calibray.result.record import Record
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.scenes.scene import exported_names

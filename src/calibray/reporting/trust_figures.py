@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.prediction.predict import has_links
 from calibray.reporting.diagnostics import diagnostics
 from calibray.reporting.link_survey import residual
+from calibray.result.files import has_links
 from calibray.result.record import Record
 from calibray.study.mounting import link_mountings
 from calibray.support import figure_style as style

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Paths, take
-from calibray.prediction.predict import changed_files, has_links
 from calibray.reporting.link_survey import Survey
+from calibray.result.files import changed_files, has_links
 from calibray.result.record import Record
 from calibray.scenes import Triangles
 from calibray.study import Setup

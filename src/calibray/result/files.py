@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from calibray.errors import InputError
+from calibray.measurements import Measurements
 from calibray.parameters import is_effect
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import (
@@ -306,6 +308,31 @@ def check_same_study(study: Study, folder: Path) -> None:
             raise InputError(
                 f"{folder}: its result belongs to another study; give another folder, or run the study again"
             )
+
+
+def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
+    """Names of the files of the scene and antennas that have changed since the calibration.
+
+    `files` are the current files with their digests, as `Setup.files`.
+    """
+    if not result.provenance.files:
+        return []
+    # Files are compared by name and content, because the whole folder may have moved.
+    calibrated, current = (
+        sorted((Path(file).name, digest) for file, digest in files.items())
+        for files in (result.provenance.files, files)
+    )
+    return sorted({name for name, _ in set(calibrated) ^ set(current)})
+
+
+def has_links(result: Record, links: Measurements) -> bool:
+    """Whether a calibration has these links, with their measured values and positions, within rounding in files."""
+    table, ends = result.links, result.ends
+    pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
+    pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]
+    return len(table) == len(links) and all(
+        np.allclose(calibrated, current, rtol=1e-8, atol=1e-3) for calibrated, current in pairs
+    )
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:

@@ -427,10 +427,14 @@ def with_obstruction(
     if clutter:
         added[CLUTTER] = clutter_loss_db(links.distance, carrier)
     if cluster_m is not None:
-        squares = np.floor(links.rx[:, :2] / cluster_m).astype(int)
-        added[CLUSTER] = np.array([f"{column} {row}" for column, row in squares])
+        added[CLUSTER] = cluster_labels(links.rx, cluster_m)
     missing = {name: values for name, values in added.items() if name not in links.frame}
     return replace(links, table=links.table.assign(**missing)) if missing else links
+
+
+def cluster_labels(position: NDArray[np.float64], side: float) -> NDArray[np.str_]:
+    """The grid square of every position [n, 3], [m], as "column row" [n]; squares have a given side length [m]."""
+    return np.array([f"{column} {row}" for column, row in np.floor(position[:, :2] / side).astype(int)])
 
 
 SHORTEST: Final = 250.0

@@ -20,7 +20,7 @@ from calibray.measurements.column_names import LENGTH_UNITS, WATTS, find_length_
 from calibray.measurements.observables import KINDS
 from calibray.measurements.placement import NOT_ON_TRACK
 from calibray.scenes.checks import Finding, SceneSurfaces, scale_findings
-from calibray.scenes.obstruction import CLUSTER
+from calibray.scenes.obstruction import CLUSTER, cluster_labels
 from calibray.study.calibration_sections import NuisanceSection
 from calibray.study.model import StudyModel
 from calibray.study.mounting import largest_gain_dbi, link_antennas, link_mountings
@@ -142,7 +142,7 @@ def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Meas
     if section.per is None or section.prior == "auto":
         return 1
     if section.per == CLUSTER and CLUSTER not in links.frame and study.cluster_m is not None:
-        return len(np.unique(np.floor(links.rx[:, :2] / study.cluster_m), axis=0))
+        return len(np.unique(cluster_labels(links.rx, study.cluster_m)))
     return len(np.unique(links.table.labels(section.per)))
 
 

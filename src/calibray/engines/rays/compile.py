@@ -107,10 +107,11 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
         # In a null of the antennas, a path may have no power in replay, and only a rounding error in the engine.
-        kept = np.flatnonzero((_replayed(paths) > 0) | (table.power > ROUNDING * _free_space(paths)))
-        power, table, paths = table.power[kept], table.take(kept), take(paths, kept)
-        _check_direct(table, paths, power, setting.antennas is not None)
-        paths = replace(paths, correction=_correction(table, paths, power))
+        replayed = _without_nulls(paths)
+        kept = np.flatnonzero((replayed > 0) | (table.power > ROUNDING * _free_space(paths)))
+        power, replayed, table, paths = table.power[kept], replayed[kept], table.take(kept), take(paths, kept)
+        _check_direct(table, paths, power, None if setting.antennas is None else replayed)
+        paths = replace(paths, correction=_correction(table, paths, power, replayed))
     elif (table.kind == Kind.DIFFUSE).any():
         raise InputError(
             f"{table.source}: diffuse reflections require the power of the path, because the solid angle of their rays "
@@ -149,8 +150,8 @@ def powers(paths: Paths) -> NDArray[np.float64]:
     return (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
 
 
-def _replayed(paths: Paths) -> NDArray[np.float64]:
-    """The same power, but 0 in a null of an antenna, where it is a rounding error [P]."""
+def _without_nulls(paths: Paths) -> NDArray[np.float64]:
+    """Power gain of every path in replay, with 0 instead of the rounding error in a null of an antenna [P]."""
     gain = [(np.abs(field) ** 2).sum(axis=2).max(axis=1) for field in (paths.tx_field, paths.rx_field)]
     return np.where(np.minimum(*gain) > ROUNDING, powers(paths), 0.0)
 
@@ -329,14 +330,23 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
         )
 
 
-def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
-    """Refuse a direct path with a power that is implausible for its antennas."""
+def _check_direct(
+    table: RayTable, paths: Paths, power: NDArray[np.float64], replayed: NDArray[np.float64] | None
+) -> None:
+    """Refuse a direct path with a power [P] that is implausible for its antennas.
+
+    `replayed` is the power of every path in replay; None if the antennas are unknown.
+
+    Raises:
+        InputError: A direct path has such a power.
+    """
     direct = np.diff(paths.first) == 0
     free_space = _free_space(paths)
-    replayed, least = powers(paths) if known else free_space, ROUNDING * free_space
-    off = 10 * np.log10(np.maximum(power, least) / np.maximum(replayed, least))
+    known, least = replayed is not None, ROUNDING * free_space
+    expected = free_space if replayed is None else replayed
+    off = 10 * np.log10(np.maximum(power, least) / np.maximum(expected, least))
     # In a null, no correction can restore the power.
-    implausible = (np.abs(off) > FREE_SPACE_DB) | (_replayed(paths) == 0) if known else off > DIRECT_GAIN_DB
+    implausible = (np.abs(off) > FREE_SPACE_DB) | (expected == 0) if known else off > DIRECT_GAIN_DB
     wrong = direct & implausible
     if wrong.any():
         worst = int(np.argmax(np.where(wrong, np.abs(off), 0)))
@@ -358,8 +368,14 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
         )  # fmt: skip
 
 
-def _correction(table: RayTable, paths: Paths, power: NDArray[np.float64]) -> NDArray[np.float64]:
-    replayed = _replayed(paths)
+def _correction(
+    table: RayTable, paths: Paths, power: NDArray[np.float64], replayed: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Ratio of the stated power to that in replay [P].
+
+    Raises:
+        InputError: A path has no power in replay.
+    """
     if not (replayed > 0).all():
         material = list(paths.materials)[paths.material[paths.first[int(np.argmin(replayed))]]]
         raise InputError(

@@ -240,7 +240,7 @@ class Solver:
         shape, of_path = np.unique(np.array(buffer.shapes, dtype=np.int64), return_inverse=True)
         material = np.array([self._material_of_shape.get(key, 0) for key in shape.tolist()], dtype=np.int64)
         normal = np.zeros((count, depth, 3))
-        edge, normal_n, edge_lengths = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
+        wedge_arrays: dict[str, NDArray[np.float64]] = {}
         kind = per_interaction(buffer, "interaction_types")
         if count and kind.any():
             for step in range(depth):
@@ -251,8 +251,15 @@ class Solver:
                 # Sionna's own lengths, so that replay reproduces their known error (docs/explanation/fidelity.md).
                 after, before = self._calculate_fields._diffraction_compute_s_s_prime(buffer, source, target)
                 wedges: Any = buffer.diffracting_wedges
-                edge, normal_n = to_numpy(wedges.e_hat), to_numpy(wedges.nn)
-                edge_lengths = np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1)
+                lengths = np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1)
+                one_edge = {
+                    "edge": to_numpy(wedges.e_hat), "normal_n": to_numpy(wedges.nn), "edge_lengths": lengths
+                }  # fmt: skip
+                # A path of Sionna RT has at most one diffraction, whatever its step.
+                wedge_arrays = {
+                    name: np.broadcast_to(values[:, None], (count, depth, values.shape[1]))
+                    for name, values in one_edge.items()
+                }
         return Chains(
             source=ends.tx[traced.link],
             target=ends.rx[traced.link],
@@ -262,9 +269,7 @@ class Solver:
             material=material[of_path].reshape(count, depth),
             probability=np.array(buffer.probs, dtype=float).reshape(count, depth),
             samples=self.settings.rays,
-            edge=edge,
-            normal_n=normal_n,
-            edge_lengths=edge_lengths,
+            **wedge_arrays,
         )
 
 
