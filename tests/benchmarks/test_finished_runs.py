@@ -33,7 +33,7 @@ def test_a_misfit_benchmark_counts_only_runs_of_its_seed_settings_districts_and_
         monkeypatch.setattr("sys.argv", ["misfit.py", "--out", str(tmp_path / "runs.jsonl"), *words])
         misfit.main()
         rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-        return {row[0]: (row[-18], row[-1]) for row in rows if row[:1] in (["all"], ["thickness"])}
+        return {row[0]: (row[-20], row[-1]) for row in rows if row[:1] in (["all"], ["thickness"])}
 
     words = ("--districts", "district-1", "--repetitions", "2", "--worlds", "thickness")
     assert seconds(*words, "--seed", "1")["all"] == ("2", "1000.5")

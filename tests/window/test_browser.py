@@ -201,8 +201,12 @@ def test_what_an_editor_changed_in_the_study_is_shown_and_not_undone(walked):
         if lowest.input_value() == "1.25":
             break
         page.wait_for_timeout(100)
-    page.wait_for_timeout(600)  # until the buttons are shown again as well
-    step(page, "Parameters").get_by_role("button", name="Save parameters").click()
+    # The fixture's tab watches the study as well; a click is lost if another tab redraws the button.
+    save = step(page, "Parameters").get_by_role("button", name="Save parameters")
+    save.evaluate("button => { button.dataset.drawn = 'once' }")
+    page.wait_for_timeout(1500)
+    assert save.get_attribute("data-drawn") == "once"
+    save.click()
     page.get_by_text("Saved").first.wait_for()
     study = tomllib.loads((folder / "study.toml").read_text())
     assert next(iter(study["parameters"].values()))["bounds"][0] == 1.25

@@ -259,7 +259,8 @@ class Desk:
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
         edits: Functions that write the values shown in a step into the study's content, by tab and step.
-        show_again: Functions that redraw all steps, by tab.
+        show_again: Functions that redraw all steps after a change in a tab, by tab.
+        drawn: Content of the steps when they were last drawn; see `page`.
     """
 
     folder: StudyFolder
@@ -272,6 +273,7 @@ class Desk:
     entered: dict[str, Any] = field(default_factory=dict)
     edits: dict[tuple[str, str], Callable[[dict[str, Any]], None]] = field(default_factory=dict)
     show_again: dict[str, Callable[[], None]] = field(default_factory=dict)
+    drawn: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.jobs = Jobs(self.folder.path)
@@ -284,7 +286,7 @@ class Desk:
             self.refresh()
 
     def refresh(self) -> None:
-        """Redraw all steps of this tab."""
+        """Redraw the steps of all tabs, and the map and the command of this tab."""
         self.show_again[ui.context.client.id]()
 
     def mark(self) -> None:

@@ -43,6 +43,9 @@ def build(desk: Desk) -> None:
     def activity() -> None:
         _activity(desk, progress)
 
+    # Other tabs show what this one will show, so that no tab redraws the steps of all tabs soon after.
+    if _contents(desk) != desk.drawn:
+        _redraw(desk)
     ui.colors(primary="#1f5fa8", negative="#a11d1d", positive="#1d6b3a", info="#1f5fa8")
     ui.add_head_html(HEAD)
     with ui.element("main").classes("calibray"):
@@ -120,36 +123,48 @@ def _answer_map(desk: Desk, place: ui.label) -> None:
     ui.on("findings", examined)
 
 
+def _contents(desk: Desk) -> dict[str, object]:
+    """The content of the steps that are redrawn only if it changes, by step; and the running command.
+
+    These steps have fields, which lose their focus if they are redrawn.
+    """
+    text, files, job = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff")), desk.jobs.running()
+    return {
+        "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
+        "Measurements": (text, desk.folder.tables(), desk.folder.files((".gpx",))),
+        "Parameters": text,
+        "Run": desk.folder.study_file.is_file(),
+        "command": None if job is None else job.number,
+    }
+
+
+def _redraw(desk: Desk) -> None:
+    """Redraw, in all tabs, the steps whose content has changed and those whose content is not compared."""
+    now = _contents(desk)
+    for name, show in STEPS:
+        if name not in now or now[name] != desk.drawn.get(name):
+            show.refresh()
+    show_commands.refresh()
+    desk.drawn = now
+
+
 def _follow_changes(
     desk: Desk, activity: ui.refreshable[[], None], progress: ui.refreshable[[Job], None]
 ) -> None:
     """Redraw steps when the files in the folder or the running command have changed."""
-
-    def contents() -> dict[str, object]:
-        """The content of the steps with text fields, which are redrawn only if this content changes."""
-        text, files = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff"))
-        return {
-            "Map or plan": (text, files, desk.folder.scenes(), desk.scene),
-            "Measurements": (text, desk.folder.tables(), desk.folder.files((".gpx",))),
-            "Parameters": text,
-            "Run": desk.folder.study_file.is_file(),
-        }
-
-    shown, watched = contents(), {"job": desk.jobs.running()}
+    watched = {"job": desk.jobs.running(), "text": desk.folder.text(), "drawn": desk.drawn}
 
     def reload_map() -> None:
         ui.run_javascript(f"plan.load({json.dumps(desk.scene)})")
 
-    def refresh() -> None:
-        now = contents()
-        for name, show in STEPS:
-            if name not in now or now[name] != shown[name]:
-                show.refresh()
-        show_commands.refresh()
-        shown.update(now)
+    def follow() -> None:
         # Otherwise `watch` would redraw the command, and a click on its Stop button would be lost.
-        watched["job"] = desk.jobs.running()
+        watched.update(job=desk.jobs.running(), drawn=desk.drawn)
         activity.refresh()
+
+    def refresh() -> None:
+        _redraw(desk)
+        follow()
         reload_map()
 
     def first_map() -> None:
@@ -157,17 +172,24 @@ def _follow_changes(
         desk.mark()
 
     def watch() -> None:
-        before, job = watched["job"], desk.jobs.running()
+        before, job, text = watched["job"], desk.jobs.running(), desk.folder.text()
         # Only changed parts are redrawn, because a redrawn button loses the keyboard focus and may lose a click.
         if job is None or before is None or job.number != before.number:
             if job != before:
                 activity.refresh()
         elif job != before:
             progress.refresh(job)
-        watched["job"] = job
-        # A command that has ended may have written files, and an editor may have changed the study.
-        if (before is not None and job is None) or desk.folder.text() != shown["Parameters"]:
-            refresh()
+        # A command that has ended may have written files. An editor may have changed the study; its text counts only
+        # if it is unchanged for a second, because a study that is being written can be incomplete.
+        ended = job is None and desk.drawn["command"] is not None
+        edited = text == watched["text"] != desk.drawn["Parameters"]
+        watched.update(job=job, text=text)
+        if ended or edited:
+            _redraw(desk)
+        # This tab or another one has redrawn the steps of all tabs.
+        if watched["drawn"] != desk.drawn:
+            follow()
+            reload_map()
 
     desk.show_again[ui.context.client.id] = refresh
     ui.timer(0.1, first_map, once=True)
