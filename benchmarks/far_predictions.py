@@ -33,7 +33,7 @@ import districts
 import misfit_worlds
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
-from calibray.result.held_out import AVERAGE_OF, FITTED, WITHOUT_MATERIALS, Model
+from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, Model
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.tables import Column, Table, numbers, render
 from calibray.validation.held_out_statistics import (
@@ -55,7 +55,6 @@ USED = WAYS.index("wider out of sight")
 
 CHOSEN = "chosen without them"
 ALONE = "this, not averaged"
-NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 FEW = (Model.INITIAL, Model.CALIBRATED, Model.LOG_DISTANCE)
 CLOSE_DB = 0.3
 """Largest regret for which the choice counts as right."""
@@ -84,7 +83,7 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
     ]
     found = fit_models(part, fits)
     errors = {str(model): (loss - objective.measured)[apart] for model, loss in found.items()}
-    errors[CHOSEN], errors[ALONE] = errors[name], errors[NOT_AVERAGED.get(name, name)]
+    errors[CHOSEN], errors[ALONE] = errors[name], errors[inner.preferred]
     finite = np.isfinite(errors[name])
     inside = [float(np.mean((np.abs(errors[name]) <= half)[finite])) for half in halves]
     return inside, [float(half.mean()) for half in halves], errors

@@ -33,7 +33,7 @@ from calibray.calibration.link_diagnostics import directions_remark, region_rema
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
-from calibray.result.held_out import AVERAGE_OF, Model
+from calibray.result.held_out import Model
 from calibray.result.verdict import RemarkKind
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.assessment import Certainty, certainty
@@ -54,7 +54,6 @@ NEARLY_DB = 0.3
 IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
 OWN_PATHS = "own paths"
-NOT_AVERAGED = {str(average): name for name, average in AVERAGE_OF.items()}
 
 
 def repetition(world: World, seed: int, spread: float | None, *, draws: bool, choice: bool) -> dict[str, Any]:
@@ -81,11 +80,11 @@ def repetition(world: World, seed: int, spread: float | None, *, draws: bool, ch
     if choice and far.any():
         part = replace(planted, setup=planted.setup.with_obstruction())
         minima = {Model.CALIBRATED: trail.minima}
-        chosen = validate_problem(planted, known_minima=minima).chosen
+        validation = validate_problem(planted, known_minima=minima)
         fitted = fit_models(part, fit_variants(part, minima))
         errors = {str(name): each[far] - loss[far] for name, each in fitted.items()}
         sizes = {name: float(np.sqrt(np.mean(e**2))) for name, e in errors.items() if np.isfinite(e).all()}
-        line |= {"chosen": chosen, "far_db": sizes}
+        line |= {"chosen": validation.chosen, "preferred": validation.preferred, "far_db": sizes}
     return line | {"seconds": time.process_time() - started}
 
 
@@ -149,7 +148,7 @@ def table(lines: list[dict[str, Any]]) -> Table:
         choices = [line for line in mine if "chosen" in line]
         regret = [_regret(line, line["chosen"]) for line in choices]
         rivals = [
-            [_regret(line, NOT_AVERAGED.get(line["chosen"], line["chosen"])) for line in choices],
+            [_regret(line, line["preferred"]) for line in choices],
             *([_regret(line, name) for line in choices] for name in (Model.CALIBRATED, Model.PRIOR, average)),
         ]
         rows.append((

@@ -253,6 +253,9 @@ def test_a_result_that_is_worse_than_the_initial_values_says_so(tmp_path, away, 
     remarks = [text for text in result.remarks if "did not improve on the initial values" in text]
     assert len(remarks) == worse
     assert all(f"an RMSE of {result.initial_rmse_db:.2f} dB" in text for text in remarks)
+    assert all(
+        text.endswith("Use a larger budget (method.options), or the method 'auto'.") for text in remarks
+    )
 
 
 def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):

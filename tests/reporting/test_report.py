@@ -88,12 +88,14 @@ def predicted_by(name: str, **values: object) -> Result:
 
 def test_an_average_without_nuisances_is_a_whole_sentence():
     values = dict(shown.result().parameters)
-    average = predicted_by(Model.AVERAGE_CALIBRATED, averaged=values)
-    text = "with the calibrated materials, averaged with those of a fit with a prior"
+    near = {name: 1.01 * value for name, value in values.items()}
+    model = {"averaged": values, "parameters": near}
+    average = predicted_by(Model.AVERAGE_CALIBRATED, **model)
+    text = "with materials calibrated with a prior, averaged with the calibrated ones"
     assert prediction_text(average).startswith(
         f"Predictions and maps use the model '{Model.AVERAGE_CALIBRATED}', {text}, and the fitted offset."
     )
-    assert f"{text}." in prediction_text(predicted_by(Model.AVERAGE_CALIBRATED, averaged=values, terms=()))
+    assert f"{text}." in prediction_text(predicted_by(Model.AVERAGE_CALIBRATED, **model, terms=()))
 
 
 def test_the_model_with_obstruction_uses_the_scene_but_no_materials():

@@ -25,6 +25,7 @@ from calibray.scenes import read_scene
 from calibray.scenes.scene import exported_names
 from calibray.tables import render
 from calibray.uncertainty.verdicts import consistent
+from calibray.validation import held_out_statistics
 from calibray.validation.choice import averaged_terms
 
 NAME = next(name for name in shown.result().parameters if name.endswith(".relative_permittivity"))
@@ -165,7 +166,7 @@ def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a
         replace(model, averaged=None, parameters=values, terms=terms)
         for values, terms in (
             (model.parameters, ()),
-            (model.averaged, tuple(_tripled(term) for term in model.terms)),
+            (model.averaged, tuple(_scaled(term, 3) for term in model.terms)),
         )
     ]
     both = [replace(result, prediction=replace(result.prediction, model=one)).predict(links) for one in alone]
@@ -183,8 +184,43 @@ def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a
     assert "average" in scene_alone_text(result)
 
 
-def _tripled(term: FittedTerm) -> FittedTerm:
-    return replace(term, coefficients={label: 3 * value for label, value in term.coefficients.items()})
+def test_a_chosen_distance_law_is_averaged_with_the_model_with_a_prior(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three tenths of the scene's deviations from its distance law are planted, so the errors of both cancel."""
+    monkeypatch.setattr(held_out_statistics, "choose", lambda errors, position: Model.LOG_DISTANCE)
+    (initial, table), links = initial_campaign(), planted.links()
+    decades = np.log10(np.linalg.norm(links[["rx_x", "rx_y"]].assign(z=-1.5), axis=1))
+    scene_db = planted.path_loss(initial)
+    law_db = np.polyval(np.polyfit(decades, scene_db, 1), decades)
+    table["path_loss_db"] = 0.3 * scene_db + 0.7 * law_db
+    result = calibrate(planted.study(tmp_path, table, holdout={"blocks": 4}), engine=planted.engine())
+    model, errors = result.prediction.model, result.held_out.errors
+    assert model.name == Model.AVERAGE_LOG_DISTANCE
+    average = (errors[Model.LOG_DISTANCE] + errors[Model.PRIOR]) / 2
+    assert errors[model.name] == pytest.approx(average, nan_ok=True)
+    assert model.averaged is None
+    predicted_db = result.predict(links)
+    assert result.links.predicted_db.to_numpy() == pytest.approx(predicted_db, abs=1e-6)
+    # The two parts of the prediction, each with its whole terms.
+    law = replace(
+        model, name=Model.LOG_DISTANCE, parameters=None, terms=tuple(_scaled(term, 2) for term in model.terms)
+    )
+    scene = replace(model, name=Model.PRIOR, terms=())
+    both = [
+        replace(result, prediction=replace(result.prediction, model=one)).predict(links)
+        for one in (law, scene)
+    ]
+    assert predicted_db == pytest.approx((both[0] + both[1]) / 2, abs=1e-9)
+    assert np.abs(both[0] - both[1]).max() > 1.0
+    result.save(tmp_path / "out")
+    assert Result.load(tmp_path / "out").predict(links) == pytest.approx(predicted_db, abs=1e-9)
+    assert "calibrated with a prior, averaged with the log-distance model" in prediction_text(result)
+    assert "the average with another model" in scene_alone_text(result)
+
+
+def _scaled(term: FittedTerm, factor: float) -> FittedTerm:
+    return replace(term, coefficients={label: factor * value for label, value in term.coefficients.items()})
 
 
 def test_the_mean_of_terms_keeps_groups_that_one_model_lacks() -> None:

@@ -245,7 +245,8 @@ def test_keys_without_effect_are_named_when_the_study_is_read(tmp_path, caplog):
     planted.links().to_csv(tmp_path / "links.csv", index=False)
     facade = {"of": "marble", "boxes": [BOX], "position": "scene", "module": 2.0, "storey_height": 4.0}
     regions = {"trees": REGIONS["trees"] | {"position": "geographic"}}
-    content = planted.content("links.csv") | {"regions": regions, "facades": {"shop": facade}}
+    trace = {"edge_diffraction": True, "diffraction_lit_region": False}
+    content = planted.content("links.csv") | {"regions": regions, "facades": {"shop": facade}, "trace": trace}
     write_study(tmp_path, content)
     Study.load(tmp_path / "study.toml")
     for key, needed in (
@@ -253,10 +254,13 @@ def test_keys_without_effect_are_named_when_the_study_is_read(tmp_path, caplog):
         ("facades.shop.position", "file"),
         ("facades.shop.module", "share"),
         ("facades.shop.storey_height", "storeys"),
+        ("trace.edge_diffraction", "diffraction = true"),
+        ("trace.diffraction_lit_region", "diffraction = true"),
     ):
         assert f"study.toml: {key} has no effect without {needed}" in caplog.text
     caplog.clear()
     rules = {"of": "marble", "storeys": [1, 1], "storey_height": 4.0, "share": 0.2, "module": 2.0}
+    trace["diffraction"] = True
     write_study(tmp_path, content | {"regions": REGIONS, "facades": {"shop": rules}})
     Study.load(tmp_path / "study.toml")
     assert "no effect" not in caplog.text

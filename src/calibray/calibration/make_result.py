@@ -233,7 +233,8 @@ def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float
         or not trail.best_rmse_db > start + WORSE_DB
     ):
         return ()
-    return (Remark(RemarkKind.WORSE_THAN_START, {"start_db": start, "found_db": trail.best_rmse_db}),)
+    values = {"start_db": start, "found_db": trail.best_rmse_db, "method": study.method.name}
+    return (Remark(RemarkKind.WORSE_THAN_START, values),)
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:

@@ -29,7 +29,7 @@ from calibray.prediction.corrections import (
 )
 from calibray.prediction.observables import Replayed, as_measured, further_observables
 from calibray.result.files import changed_files
-from calibray.result.held_out import AVERAGES, NEW_GROUP, Model, PredictionModel
+from calibray.result.held_out import AVERAGES, NEW_GROUP, WITHOUT_MATERIALS, Model, PredictionModel
 from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
 from calibray.scenes.checks.positions import INSIDE, locate
@@ -405,9 +405,11 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
     # Path loss is limited to the ceiling, as in the fit and on held-out links.
     ceiling_db = result.study.objective.ceiling_db
     path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
-    best_db = path_loss_db[0]
-    if replayed.averaged > 1:
-        best_db = AVERAGES[result.prediction.model.name].of(best_db, path_loss_db[1])
+    best_db, average = path_loss_db[0], AVERAGES.get(result.prediction.model.name)
+    if average is not None and average.second in WITHOUT_MATERIALS:
+        best_db = average.of(best_db, without_scene(result.study, links))
+    elif average is not None and replayed.averaged > 1:
+        best_db = average.of(best_db, path_loss_db[1])
     return np.vstack([best_db, path_loss_db[replayed.averaged :]])
 
 

@@ -36,7 +36,7 @@ def prediction_text(record: Record) -> str:
         )
     terms = [term.name for term in model.terms]
     added = f" and the fitted {' and '.join(terms)}" if terms else ""
-    if model.averaged is not None:
+    if model.name in _AVERAGED:
         added = f", averaged with {_AVERAGED[Model(model.name)]}{',' if terms else ''}{added}"
     fallback = record.prediction.fallback
     text = f"Predictions and maps use the model {str(model.name)!r}, with {source}{added}."
@@ -48,8 +48,10 @@ def prediction_text(record: Record) -> str:
 
 _AVERAGED: Final = {
     Model.AVERAGE_INITIAL: "the initial ones (weight 1/3)",
-    Model.AVERAGE_CALIBRATED: "those of a fit with a prior",
+    Model.AVERAGE_CALIBRATED: "the calibrated ones",
     Model.AVERAGE_OFFSETS: "those of a fit with a prior and offsets",
+    Model.AVERAGE_LOG_DISTANCE: "the log-distance model",
+    Model.AVERAGE_OBSTRUCTION: "the log-distance model with obstruction",
 }
 
 
@@ -108,7 +110,7 @@ def scene_alone_text(record: Record) -> str:
         *(["the errors of antennas"] if any(name.startswith((POSE, RECEIVER)) for name in values) else []),
         *(f"the roughness of {name}" for name in dict.fromkeys((*record.study.roughness_mm, *rough))),
         *(f"the {term.name}" for term in model.terms),
-        *([] if model.averaged is None else ["the average with other materials"]),
+        *(["the average with another model"] if model.name in _AVERAGED else []),
     ]
     cause = " or ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:]))) or "its ceiling"
     group, mean = np.zeros(len(difference)), "their mean"

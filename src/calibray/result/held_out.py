@@ -24,6 +24,8 @@ class Model(StrEnum):
     AVERAGE_INITIAL = "average of prior and initial materials"
     AVERAGE_CALIBRATED = "average of calibrated and prior"
     AVERAGE_OFFSETS = "average of calibrated and offsets"
+    AVERAGE_LOG_DISTANCE = "average of prior and log-distance"
+    AVERAGE_OBSTRUCTION = "average of prior and log-distance with obstruction"
     RESIDUAL_FIELD = "calibrated with residual field"
     LOG_DISTANCE = "log-distance"
     OBSTRUCTION = "log-distance with obstruction"
@@ -57,15 +59,20 @@ class Average(NamedTuple):
 
 AVERAGES: Final[dict[str, Average]] = {
     Model.AVERAGE_INITIAL: Average(Model.PRIOR, Model.INITIAL, 2 / 3),
-    Model.AVERAGE_CALIBRATED: Average(Model.CALIBRATED, Model.PRIOR),
+    Model.AVERAGE_CALIBRATED: Average(Model.PRIOR, Model.CALIBRATED),
     Model.AVERAGE_OFFSETS: Average(Model.CALIBRATED, Model.OFFSETS),
+    Model.AVERAGE_LOG_DISTANCE: Average(Model.PRIOR, Model.LOG_DISTANCE),
+    Model.AVERAGE_OBSTRUCTION: Average(Model.PRIOR, Model.OBSTRUCTION),
 }
 """The averages by name. docs/measurements/predictions.md compares two thirds with one half."""
 
 AVERAGE_OF: Final[dict[str, Model]] = {
     Model.INITIAL: Model.AVERAGE_INITIAL,
     Model.CALIBRATED: Model.AVERAGE_CALIBRATED,
+    Model.PRIOR: Model.AVERAGE_CALIBRATED,
     Model.OFFSETS: Model.AVERAGE_OFFSETS,
+    Model.LOG_DISTANCE: Model.AVERAGE_LOG_DISTANCE,
+    Model.OBSTRUCTION: Model.AVERAGE_OBSTRUCTION,
 }
 """The average that replaces a chosen model in predictions."""
 

@@ -415,3 +415,7 @@ def _keys_without_effect(content: Mapping[str, Any]) -> Iterator[tuple[str, str]
             for key, needed in keys.items():
                 if key in table and needed not in table:
                     yield dotted((section, name, key)), needed
+    trace = content.get("trace", {})
+    for key, default in (("edge_diffraction", False), ("diffraction_lit_region", True)):
+        if trace.get(key, default) != default and not trace.get("diffraction", False):
+            yield f"trace.{key}", "diffraction = true"

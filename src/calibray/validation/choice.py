@@ -84,7 +84,7 @@ def fit_prediction_model(
 ) -> FittedModel:
     """Fit the chosen model to all links that have a nonzero weight.
 
-    An average uses the scene of its first model, and also stores the parameters of the second.
+    An average uses the scene of its first model, and also stores the parameters of the second, if it has any.
 
     Args:
         problem: The problem.
@@ -97,31 +97,32 @@ def fit_prediction_model(
     Returns:
         The fitted model. Predictions and exports trace with its materials, so its values contain this change.
     """
-    setup, parameters = problem.setup, problem.parameters
+    parameters, study = problem.parameters, problem.setup.study
     uses_scene = name not in WITHOUT_MATERIALS
     average = AVERAGES.get(name)
-    first = average.first if average else Model(name) if uses_scene else Model.CALIBRATED
-    variant = fit_variant(problem, trail, first)
-    candidate, scene_db = variant.candidate, variant.modelled
-    objective, modelled = variant.objective, scene_db
-    if not uses_scene:
-        make = models.log_distance if name == Model.LOG_DISTANCE else models.obstructed
-        objective, modelled = make(
-            setup.links, problem.objective, models.without_scene(setup.study, setup.links)
-        )
-    terms, path_loss_db = fitted_terms(objective, modelled, setup.study), objective.with_nuisance(modelled)
-    averaged = None
+    variant = fit_variant(
+        problem, trail, average.first if average else Model(name) if uses_scene else Model.CALIBRATED
+    )
+    candidate, objective, modelled = variant.candidate, variant.objective, variant.modelled
+    scene_db, averaged = modelled, None
+    if uses_scene:
+        terms, path_loss_db = fitted_terms(objective, modelled, study), objective.with_nuisance(modelled)
+    else:
+        terms, path_loss_db = fit_without_materials(problem, name)
     if average is not None:
-        other = fit_variant(problem, trail, average.second)
-        averaged = parameters.named(other.candidate)
-        terms = averaged_terms(
-            terms, fitted_terms(other.objective, other.modelled, setup.study), average.weight
-        )
-        path_loss_db = average.of(path_loss_db, other.objective.with_nuisance(other.modelled))
+        if average.second in WITHOUT_MATERIALS:
+            other_terms, other_db = fit_without_materials(problem, average.second)
+        else:
+            other = fit_variant(problem, trail, average.second)
+            averaged = parameters.named(other.candidate)
+            other_terms = fitted_terms(other.objective, other.modelled, study)
+            other_db = other.objective.with_nuisance(other.modelled)
+        terms = averaged_terms(terms, other_terms, average.weight)
+        path_loss_db = average.of(path_loss_db, other_db)
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
-        with_prior_mean(terms, setup.study) if name == Model.OBSTRUCTION else terms,
+        terms,
         residuals.rms_db,
         residuals.basis,
         residuals.links,
@@ -132,12 +133,12 @@ def fit_prediction_model(
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
     # In an exported scene, each mesh has one material, facades have the material of their walls, and links are at the
     # stated positions.
-    walls = {name: section.of for name, section in setup.study.facades.items()}
+    walls = {name: section.of for name, section in study.facades.items()}
     displaced = [name for name in parameters.names if displaces(name)]
-    extra = len(parameters.of_effects) or setup.study.regions or setup.study.roughness_mm
+    extra = len(parameters.of_effects) or study.regions or study.roughness_mm
     if displaced:
-        stated = setup.placed_at(dict.fromkeys(displaced, 0.0))
-        sampled = setup.study.trace.refraction or setup.study.trace.diffuse_reflection
+        stated = problem.setup.placed_at(dict.fromkeys(displaced, 0.0))
+        sampled = study.trace.refraction or study.trace.diffuse_reflection
         engine = replay(stated, stated.trace(materials if sampled else None))
         scene_db = engine.scene_path_loss(candidate[None], walls)[0]
     elif (walls or extra) and isinstance(problem.engine, ReplaysScene):
@@ -171,6 +172,15 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
     point = models.find_minima(variant, best[None], SEARCHES)[0]
     modelled = variant.evaluate(point[None]).modelled[0]
     return FittedVariant(problem.parameters.from_search(point), variant.objective, modelled)
+
+
+def fit_without_materials(problem: Problem, name: str) -> tuple[tuple[FittedTerm, ...], NDArray[np.float64]]:
+    """Terms of a log-distance model that is fitted to the links with a weight, and its path loss [L], [dB]."""
+    study, links = problem.setup.study, problem.setup.links
+    make = models.log_distance if name == Model.LOG_DISTANCE else models.obstructed
+    model = make(links, problem.objective, models.without_scene(study, links))
+    terms = fitted_terms(model.objective, model.known_db, study)
+    return (with_prior_mean(terms, study) if name == Model.OBSTRUCTION else terms), model.path_loss_db()
 
 
 def averaged_terms(

@@ -137,8 +137,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out residuals [n], [dB], which include those of `Model.INITIAL`.
 
     The initial materials are kept unless another model is better by more than both the bootstrap error of the
-    difference and `LEAST_GAIN`. The calibrated model is chosen only if it is significantly better than the model with a
-    prior. Kriging is never chosen, because it predicts well only near the measured links.
+    difference and `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
     """
     chosen: str = Model.INITIAL
     for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
@@ -147,18 +146,22 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
             error_db = np.inf if comparison.error_db is None else comparison.error_db
             margin_db = max(error_db, LEAST_GAIN * comparison.baseline_rmse_db)
             chosen = name if comparison.gain_db > margin_db else chosen
-    if chosen == Model.CALIBRATED and Model.PRIOR in errors:
-        with_prior = {Model.PRIOR: errors[Model.PRIOR]}
-        if not compare(errors[chosen], with_prior, position).helped:
-            chosen = Model.PRIOR
     return chosen
 
 
 def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
-    """The prediction model: the model chosen by held-out residuals, or the average that replaces it, if any."""
+    """The prediction model: the model chosen by held-out residuals, or the average that replaces it, if any.
+
+    A log-distance model is not averaged if this increases its RMSE by more than `LEAST_GAIN`, because the scene may be
+    much worse.
+    """
     name = choose(errors, position)
     average = AVERAGE_OF.get(name, name)
-    return average if average in errors else name
+    if average not in errors:
+        return name
+    rmse_db = [float(np.sqrt(np.mean(errors[model] ** 2))) for model in (name, average)]
+    keeps = name in WITHOUT_MATERIALS and rmse_db[1] > (1.0 + LEAST_GAIN) * rmse_db[0]
+    return name if keeps else average
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:

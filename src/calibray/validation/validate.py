@@ -215,7 +215,7 @@ def fit_models(
         )
         for name, (variant, minima) in fits.items()
     }
-    path_loss_db |= averages(path_loss_db)
     path_loss_db |= without_paths(setup, objective)
+    path_loss_db |= averages(path_loss_db)
     field = kriged(Model.RESIDUAL_FIELD, setup.links, objective, path_loss_db[Model.CALIBRATED])
     return path_loss_db | field

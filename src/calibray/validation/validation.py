@@ -106,6 +106,11 @@ class Validation(HeldOutErrors):
         return predicting(self._on(self.judged), self.position[self.judged])
 
     @cached_property
+    def preferred(self) -> str:
+        """The model chosen by held-out residuals; predictions average it with a second model (`chosen`)."""
+        return choose(self._on(self.judged), self.position[self.judged])
+
+    @cached_property
     def nested_rmse_db(self) -> float:
         """RMSE if each block is predicted by the model that is chosen on the other blocks [dB]."""
         errors = np.full(len(self.block), np.nan)
@@ -128,11 +133,9 @@ class Validation(HeldOutErrors):
     @property
     def choice(self) -> str:
         """A sentence that names the model chosen for predictions, with the reason."""
-        errors = self._on(self.judged)
-        best = least(errors, (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
-        chosen = choose(errors, self.position[self.judged])
-        partner = next((name for name in AVERAGES.get(self.chosen, ())[:2] if name != chosen), None)
-        return choice_text(chosen, best, partner)
+        best = least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
+        partner = next((name for name in AVERAGES.get(self.chosen, ())[:2] if name != self.preferred), None)
+        return choice_text(self.preferred, best, partner)
 
     def scale(self, name: str) -> float:
         """Standard deviation expected for a model's residuals on new links [dB]: the RMS of its held-out residuals."""
