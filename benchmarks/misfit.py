@@ -30,6 +30,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from calibray.calibration.link_diagnostics import directions_remark, region_remark
+from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
@@ -206,7 +207,12 @@ def main() -> None:
             (w, turn) for w in worlds for turn in range(given.repetitions) if (name, w, turn) not in done
         ]
         started = time.process_time()
-        made = make(name, given.folder, tuple(dict.fromkeys(world for world, _ in missing)))
+        try:
+            made = make(name, given.folder, tuple(dict.fromkeys(world for world, _ in missing)))
+        except InputError as error:
+            # Some districts draw a carrier that ITU-R P.2040-3 does not cover for their materials.
+            print(f"{name}: cannot be made; {error}", file=sys.stderr)
+            continue
         print(f"{name}: {time.process_time() - started:.0f} s of CPU to make its worlds", file=sys.stderr)
         for world, turn in missing:
             line = repetition(
