@@ -14,6 +14,7 @@ import two_ray
 from calibray.calibration.result import Result
 from calibray.errors import EngineError, InputError
 from calibray.fitting import ray_fit
+from calibray.result.held_out import Model
 from calibray.study.toml_file import study_text
 from commands import run
 
@@ -140,17 +141,18 @@ def test_a_second_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
 def test_predictions_and_the_page_show_the_rays_of_the_program(
     finished: tuple[Path, str], tmp_path: Path
 ) -> None:
-    """One call gives the rays of new links; its path loss is that of the program."""
+    """Two calls give the rays of new links for both models of an average; their path loss is that of the program."""
     folder, _ = finished
     before, result = calls(folder), Result.load(folder / "out")
     new = pd.DataFrame([[0.0, 0.0, 10.0, 20.0, 30.0, 2.0]], columns=list(two_ray.COLUMNS))
     predicted = result.predict(new)
-    assert calls(folder) == before + 1
+    assert calls(folder) == before + 2
     setup = cb.Setup.open(result.study, links=result.study.places(_rows(new)))
-    used = result.prediction.model.parameters
-    assert used is not None
-    answered = cb.engines.make(setup).path_loss(np.array([list(used.values())]))[0]
-    np.testing.assert_allclose(predicted, answered, atol=1e-6)
+    model = result.prediction.model
+    assert model.name == Model.AVERAGE_CALIBRATED
+    used = [list(values.values()) for values in (model.parameters, model.averaged) if values is not None]
+    answered = cb.engines.make(setup).path_loss(np.array(used))
+    np.testing.assert_allclose(predicted, answered.mean(axis=0), atol=1e-6)
     before = calls(folder)
     assert run("report", folder / "out", "-o", tmp_path / "report.html").exit_code == 0
     assert "The model represents the program" in (tmp_path / "report.html").read_text()

@@ -242,7 +242,7 @@ def test_a_run_with_blocks_is_validated_by_them(tmp_path, noisy):
     assert found.holdout_rmse_db > found.rmse_db
     assert found.prediction.model.basis.endswith("errors on 2 blocks held out in turn")
     assert any(remark.startswith("Calibration ") for remark in found.remarks)
-    assert found.prediction.model.name.startswith("calibrated")
+    assert found.prediction.model.name == Model.AVERAGE_CALIBRATED
 
 
 def test_groups_that_are_held_out_as_a_whole_are_announced(tmp_path, noisy, caplog):

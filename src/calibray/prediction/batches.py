@@ -164,11 +164,10 @@ def announce(result: Record, links: int, what: str = "links") -> None:
     if result.prediction.model.parameters is None:
         LOG.info("%s, predicted without a trace: the log-distance model uses no scene", counted)
         return
-    if (engine := result.study.engine).external:
-        once = engine.exports_rays or result.prediction.model.averaged is None
+    if result.study.engine.external:
         LOG.info(
             "%s: the program is called %s per batch; the result's RT calls do not include these calls",
-            counted, "once" if once else "twice",
+            counted, "once" if result.prediction.model.averaged is None else "twice",
         )  # fmt: skip
         return
     calibrated, seconds = len(result.links), _seconds(result, links)

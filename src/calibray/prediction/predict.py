@@ -357,8 +357,9 @@ def _replay(
 ) -> Replayed | None:
     """The engine for opened links, with the values of the prediction model and of every draw; None without a scene.
 
-    A program that returns path loss is called for the values of the prediction model, because the replay of another ray
-    tracer has different antennas and physics. The replay provides the change in path loss for each draw.
+    A program is called for the values of the prediction model, and for both sets of values of an average, because the
+    replay of another ray tracer has different antennas and physics. The replay provides the change in path loss for
+    each draw.
     """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
@@ -379,8 +380,13 @@ def _replay(
         answers = _answers(program, values[:averaged, : len(prediction.model.parameters)])
         if not draws and not result.study.observables:
             return Replayed(program, values, averaged, answers)
-    traced = setup.trace(traced_materials(result, prediction.materials), progress)
-    return Replayed(replay(setup, traced), values, averaged, answers)
+    engine = replay(setup, setup.trace(traced_materials(result, prediction.materials), progress))
+    if result.study.engine.exports_rays and averaged > 1:
+        second = replay(
+            setup, setup.trace(setup.parameters.materials(values[1], setup.scene.materials), progress)
+        )
+        answers = np.vstack([engine.path_loss(values[:1]), second.path_loss(values[1:])])
+    return Replayed(engine, values, averaged, answers)
 
 
 def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64]:
