@@ -100,25 +100,19 @@ def fit_prediction_model(
     parameters, study = problem.parameters, problem.setup.study
     uses_scene = name not in WITHOUT_MATERIALS
     average = AVERAGES.get(name)
-    variant = fit_variant(
-        problem, trail, average.first if average else Model(name) if uses_scene else Model.CALIBRATED
-    )
+    first = average.first if average else Model(name)
+    variant = fit_variant(problem, trail, first if uses_scene else Model.CALIBRATED)
     candidate, objective, modelled = variant.candidate, variant.objective, variant.modelled
     scene_db, averaged = modelled, None
-    if uses_scene:
-        terms, path_loss_db = fitted_terms(objective, modelled, study), objective.with_nuisance(modelled)
-    else:
-        terms, path_loss_db = fit_without_materials(problem, name)
+    terms, path_loss_db = variant.predicted(study) if uses_scene else fit_without_materials(problem, first)
     if average is not None:
         if average.second in WITHOUT_MATERIALS:
-            other_terms, other_db = fit_without_materials(problem, average.second)
+            second = fit_without_materials(problem, average.second)
         else:
             other = fit_variant(problem, trail, average.second)
-            averaged = parameters.named(other.candidate)
-            other_terms = fitted_terms(other.objective, other.modelled, study)
-            other_db = other.objective.with_nuisance(other.modelled)
-        terms = averaged_terms(terms, other_terms, average.weight)
-        path_loss_db = average.of(path_loss_db, other_db)
+            averaged, second = parameters.named(other.candidate), other.predicted(study)
+        terms = averaged_terms(terms, second[0], average.weight)
+        path_loss_db = average.of(path_loss_db, second[1])
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
@@ -158,6 +152,11 @@ class FittedVariant:
     candidate: NDArray[np.float64]
     objective: Objective
     modelled: NDArray[np.float64]
+
+    def predicted(self, study: StudyModel) -> tuple[tuple[FittedTerm, ...], NDArray[np.float64]]:
+        """The nuisance terms, and path loss with nuisance [L], [dB]."""
+        terms = fitted_terms(self.objective, self.modelled, study)
+        return terms, self.objective.with_nuisance(self.modelled)
 
 
 def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:

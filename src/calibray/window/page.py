@@ -161,11 +161,11 @@ def _follow_changes(
         # Otherwise `watch` would redraw the command, and a click on its Stop button would be lost.
         watched.update(job=desk.jobs.running(), drawn=desk.drawn)
         activity.refresh()
+        reload_map()
 
     def refresh() -> None:
         _redraw(desk)
         follow()
-        reload_map()
 
     def first_map() -> None:
         reload_map()
@@ -189,7 +189,6 @@ def _follow_changes(
         # This tab or another one has redrawn the steps of all tabs.
         if watched["drawn"] != desk.drawn:
             follow()
-            reload_map()
 
     desk.show_again[ui.context.client.id] = refresh
     ui.timer(0.1, first_map, once=True)
