@@ -46,6 +46,14 @@ class Exact(Calls):
         return self.path_loss(candidates), np.stack(slopes, axis=2)
 
 
+class Rippled(Calls):
+    """The program with fading that a few calls cannot show."""
+
+    def path_loss(self, candidates):
+        ripple = np.random.default_rng(1).uniform(3.0, 6.0, (3, len(self.links)))
+        return super().path_loss(candidates) + 2.0 * np.sin(candidates @ ripple)
+
+
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory) -> Study:
     """A study of the program with noisy links, without a cheap model."""
@@ -95,3 +103,16 @@ def test_too_few_calls_give_the_whole_range(asked):
         assert found.verdict == "not identifiable"
         assert found.approximate, name
         assert reason_text(found.reason).startswith("3 calls of the engine are too few")
+
+
+def test_calls_that_do_not_predict_one_another_give_the_whole_range(asked):
+    """Otherwise, a posterior would be narrow at the best call, where alone an emulator is exact."""
+    setup = Setup.open(asked)
+    problem = Problem.of(setup, Rippled(setup))
+    trail = search(problem, VectorSurrogate(*setup.parameters.search_bounds, budget=6))
+    assessed = certainty(problem, trail)
+    assert assessed.posterior is None
+    for found in assessed.record.intervals.values():
+        assert [found.lower, found.upper] == planted.BOUNDS
+        assert found.reason.values["error_db"] > 0.5 * trail.best_value
+        assert "each call is predicted from the others with an error of" in reason_text(found.reason)

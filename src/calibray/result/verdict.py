@@ -33,7 +33,8 @@ class ReasonKind(StrEnum):
     NOISE = "noise"  # change_db over the range, noise_db
     OUTSIDE_INTERVAL = "outside interval"  # value with the lowest RMSE
     TOO_FEW_LINKS = "too few links"  # links
-    TOO_FEW_CALLS = "too few calls"  # calls
+    # calls; error_db of predicting calls, and rmse_db of the best one, if the calls predict one another
+    TOO_FEW_CALLS = "too few calls"
     NO_NOISE = "no noise"
     TOO_MANY_LINKS = "too many links"  # limit; the interval follows from the curvature
 

@@ -120,6 +120,12 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ),
     ReasonKind.TOO_FEW_CALLS: lambda values, _: (
         f"{values['calls']:.0f} calls of the engine are too few to show how path loss depends on any parameter"
+        + (
+            f": each call is predicted from the others with an error of {values['error_db']:.2g} dB, and the best RMSE "
+            f"is {values['rmse_db']:.2g} dB; use a larger budget"
+            if "error_db" in values
+            else ""
+        )
     ),
     ReasonKind.NO_NOISE: lambda values, _: "the data contain no noise",
     ReasonKind.TOO_MANY_LINKS: lambda values, _: (
