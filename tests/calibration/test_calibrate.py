@@ -101,6 +101,38 @@ def test_every_method_keeps_the_contract(tmp_path, exact, method):
     assert np.sqrt(np.mean((loss - exact.path_loss_db) ** 2)) == pytest.approx(result.rmse_db, abs=1e-9)
 
 
+class BlackBox:
+    """The engine without its derivatives."""
+
+    def __init__(self) -> None:
+        self.parameters, self.materials, self.calls = (
+            planted.engine().parameters,
+            planted.engine().materials,
+            0,
+        )
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        self.calls += len(candidates)
+        return planted.engine().path_loss(candidates)
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_initial_values_that_a_program_was_called_for_may_be_the_best(tmp_path, exact, fits):
+    engine, method = BlackBox(), {"name": "gwo", "options": {"population": 4, "iterations": 3}}
+    if fits:
+        starts = zip(engine.parameters, planted.TRUTH.values(), strict=True)
+        items = tuple(replace(each, start=value) for each, value in starts)
+        engine.parameters = replace(engine.parameters, items=items)
+    result = calibrate(planted.study(tmp_path, exact, method=method), engine=engine)
+    assert result.rt_calls == len(result.history)
+    assert result.history.rmse_db.min() > 0.1
+    if fits:
+        assert result.parameters == planted.TRUTH
+        assert result.rmse_db < 1e-9
+    else:
+        assert result.rmse_db == result.history.rmse_db.min()
+
+
 @pytest.mark.parametrize("method", ["auto", "gwo"])
 def test_the_seed_determines_a_calibration(tmp_path, exact, method):
     one, again, other = (run(tmp_path, exact, method, seed=seed) for seed in (4, 4, 5))

@@ -234,6 +234,8 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     trail.ledger_hits = _hits(engine) - hits
     # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
+    if not (problem.differentiable or problem.observed):
+        _compare_start(problem, trail)
     if not np.isfinite(trail.best_rmse_db):
         raise InputError(
             "every candidate loses the path of at least one link; exclude such links or use no_path = 'censor'"
@@ -242,6 +244,16 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     if not len(trail.best_modelled):
         trail.best_modelled = problem.modelled(optimizer.best.x[None])[0]
     return trail
+
+
+def _compare_start(problem: Problem, trail: Trail) -> None:
+    """Make the initial values the best candidate if they fit better; they were called before the search."""
+    start, modelled = problem.parameters.start, problem.before
+    residuals = problem.residuals(start[None], modelled[None])[0]
+    value = float(np.sqrt(np.mean(residuals**2)))
+    if value < trail.best_value:
+        trail.best, trail.best_modelled, trail.best_value = start, modelled, value
+        trail.best_rmse_db = float(np.sqrt(np.mean(residuals[: problem.objective.num_counted] ** 2)))
 
 
 def _hits(engine: Engine) -> int:
