@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pandas as pd
 import pytest
@@ -88,6 +89,55 @@ def test_only_scattering_that_a_scene_states_is_stated_by_its_study(
     assert study.materials["marble"].scattering_coefficient == pytest.approx(0.3)
     assert study.materials["concrete"].scattering_coefficient is None
     assert study.opened().scene.materials["concrete"].scattering_coefficient == 0.0
+
+
+def test_what_sections_do_not_state_remains_that_of_the_scene(measured: np.ndarray, tmp_path: Path) -> None:
+    scene = street()
+    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
+    concrete = scene.radio_materials["concrete"]
+    concrete.scattering_pattern = rt.BackscatteringPattern(alpha_r=20, alpha_i=10, lambda_=0.5)
+    study = cb.Study.from_sionna(
+        scene, measured, tmp_path,
+        materials={"glass": {"thickness": 0.1}, "marble": {"itu": "wood"}}, antennas={"rx": {"pattern": "dipole"}},
+    )  # fmt: skip
+    materials = study.opened().scene.materials
+    assert materials["concrete"].scattering_pattern == "backscattering"
+    assert materials["concrete"].alpha_i == 10
+    assert materials["glass"].thickness == 0.1
+    glass = np.array(scene.radio_materials["glass"].relative_permittivity).item()
+    assert materials["glass"].relative_permittivity == pytest.approx(glass, rel=1e-6)
+    assert materials["marble"].relative_permittivity == pytest.approx(1.99)
+    assert (study.antennas.tx.pattern, study.antennas.rx.pattern) == ("tr38901", "dipole")
+    assert study.antennas.known
+
+
+def test_all_materials_but_air_and_metal_are_calibrated(measured: np.ndarray, tmp_path: Path) -> None:
+    scene = street()
+    steel = rt.RadioMaterial("steel", relative_permittivity=2.0, conductivity=1e7, thickness=0.02)
+    foam = rt.RadioMaterial("foam", relative_permittivity=1.05, conductivity=0.0, thickness=0.02)
+    board = rt.ITURadioMaterial("board", "ceiling_board", thickness=0.02)
+    for material, name in zip((steel, foam, board), sorted(scene.objects)[:3], strict=True):
+        scene.objects[name].radio_material = material
+    study = cb.Study.from_sionna(scene, measured, tmp_path / "a")
+    assert {name.split(".")[0] for name in study.parameters} & {"steel", "foam", "board"} == {"board"}
+    assert study.parameters["board.relative_permittivity"].bounds == (1.36, 15.0)
+    for item in scene.objects.values():
+        item.radio_material = steel
+    with pytest.raises(InputError, match="metal or air"):
+        cb.Study.from_sionna(scene, measured, tmp_path / "b")
+
+
+def test_objects_with_similar_names_are_different_objects(measured: np.ndarray, tmp_path: Path) -> None:
+    scene = street()
+    marble = scene.radio_materials["marble"]
+    added = [
+        rt.SceneObject(fname=rt.scene.sphere, name=name, radio_material=marble) for name in ("銀行", "病院")
+    ]
+    scene.edit(add=added)
+    study = cb.Study.from_sionna(scene, measured, tmp_path)
+    names = [item.name for item in study.opened().scene.objects]
+    assert len(set(names)) == len(names)
+    assert {"object-_", "object-_-2"} <= {*names}
 
 
 def test_wet_ground_starts_within_its_default_bounds(measured: np.ndarray, tmp_path: Path) -> None:
@@ -300,6 +350,11 @@ def test_what_a_study_cannot_state_is_refused(measured: np.ndarray, tmp_path: Pa
     scene = street()
     scene.tx_array = rt.PlanarArray(num_rows=2, num_cols=1, pattern="iso", polarization="V")
     refused(scene, "has 2 elements")
+    scene = street()
+    scene.rx_array = rt.AntennaArray(
+        antenna_pattern=scene.rx_array.antenna_pattern, normalized_positions=mi.Point3f(0, 0.5, 0)
+    )
+    refused(scene, "not at the position of the device")
     scene = street()
     scene.transmitters["tx1"].orientation = [1.0, 0, 0]
     refused(scene, "different orientations")

@@ -379,20 +379,15 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
     """The entries of ``[parameters]``: permittivities and, indoors, conductivities, which determine wall losses."""
-    materials = {
-        name: material
-        for name, material in scene.materials.items()
-        # Leave out metal, which reflects nearly everything, and air.
-        if material.conductivity < 1e6 and material.relative_permittivity > 1.5
-    }
+    bounds_of = permittivity_bounds(scene.materials)
     # Links can seldom identify more than six materials.
-    names = list(materials)[:6]
+    names = list(bounds_of)[:6]
     if not names:
         raise InputError(f"{links.scene}: no material to calibrate; all materials are metal or air")
     entries: dict[str, dict[str, Any]] = {}
     for name in names:
-        permittivity, conductivity = materials[name].relative_permittivity, materials[name].conductivity
-        entries[f"{name}.relative_permittivity"] = {"bounds": permittivity_bounds(permittivity)}
+        conductivity = scene.materials[name].conductivity
+        entries[f"{name}.relative_permittivity"] = {"bounds": bounds_of[name]}
         if indoors and conductivity > 0:
             bounds = [min(1e-3, float(f"{conductivity / 10:.0e}")), 3.0]
             entries[f"{name}.conductivity"] = {"bounds": bounds, "scale": "log"}

@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
+from calibray.materials import Material
 from calibray.measurements import (
     POSITION_COLUMNS,
     TRACK_COLUMNS,
@@ -87,8 +88,9 @@ class Study(StudyModel):
                 folder if None.
             overwrite: Whether to replace files in the folder that Calibray did not write.
             **sections: Sections of the study file that replace the defaults, such as ``trace={"max_depth": 5}`` or
-                ``links={"quantity": "received_power"}``. Without `parameters`, the permittivities of all materials
-                except air and metal are calibrated.
+                ``links={"quantity": "received_power"}``. Materials, constants of a material, and antennas that are not
+                given remain those of the scene. Without `parameters`, the permittivities of all materials except air
+                and metal are calibrated.
 
         Returns:
             The study; `Result.apply` sets the calibrated materials in the scene.
@@ -210,14 +212,29 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 
 VALUE: Final = "measured"
+AIR: Final = 1.1
+"""Largest permittivity of a material that counts as air; the lowest in ITU-R P.2040 is 1.26, of ceiling board."""
+
 LARGEST_PERMITTIVITY: Final = 15.0
 """Default upper bound of a calibrated permittivity, more than twice the largest permittivity of a building material in
 ITU-R P.2040."""
 
 
-def permittivity_bounds(start: float) -> list[float]:
-    """Default bounds of a calibrated permittivity. Wet ground has a much higher permittivity than buildings."""
-    return [1.5, max(LARGEST_PERMITTIVITY, round(2 * start))]
+METAL: Final = 1e6
+"""Smallest conductivity of a material that counts as metal [S/m]; ITU-R P.2040 has 1e7. Metal reflects nearly all
+power at any permittivity."""
+
+
+def permittivity_bounds(materials: Mapping[str, Material]) -> dict[str, list[float]]:
+    """Default bounds of the permittivities, by name, of all materials but air and metal.
+
+    Ceiling board has a lower permittivity than other building materials, and wet ground a much higher one.
+    """
+    return {
+        name: [min(1.5, round(1 + 0.75 * (start - 1), 3)), max(LARGEST_PERMITTIVITY, round(2 * start))]
+        for name, start in ((name, item.relative_permittivity) for name, item in materials.items())
+        if start > AIR and materials[name].conductivity < METAL
+    }
 
 
 def _write_live_study(
@@ -243,37 +260,46 @@ def _write_live_study(
     }
     write_scene(folder, live.objects, constants, overwrite=overwrite)
     write_table(folder / "links.csv", table)
+    bounds = permittivity_bounds(live.materials)
+    if not bounds and "parameters" not in sections:
+        raise InputError(
+            "parameters: all materials of the scene are metal or air; give the parameters to calibrate"
+        )
     power = {"tx_power_dbm": "tx_power_dbm"} if links.get("quantity") == "received_power" else {}
-    antennas = zip(("tx", "rx"), live.antennas, strict=True)
     ends = {"tx": POSITION_COLUMNS[:3], "rx": POSITION_COLUMNS[3:]}
+    antennas = {
+        end: asdict(antenna) | {"orientation": list(antenna.orientation)}
+        for end, antenna in zip(ends, live.antennas, strict=True)
+    }
+    # A scattering coefficient of 0 is Sionna RT's default; stated here, it would count as exact.
+    materials = {
+        name: {
+            key: value for key, value in constants[name].items() if value or key != "scattering_coefficient"
+        }
+        | {"scattering_pattern": item.scattering_pattern}
+        for name, item in live.materials.items()
+    }
+    given = dict(sections.get("materials", {}))
     return {
         "version": 1,
         "scene": {"file": "scene.xml", "frequency": live.frequency},
-        # A scattering coefficient of 0 is Sionna RT's default; stated here, it would count as exact.
-        "materials": {
-            name: {
-                key: value
-                for key, value in constants[name].items()
-                if value or key != "scattering_coefficient"
-            }
-            | {"scattering_pattern": item.scattering_pattern}
-            for name, item in live.materials.items()
-        },
-        "antennas": {
-            **{
-                end: asdict(antenna) | {"orientation": list(antenna.orientation)} for end, antenna in antennas
-            },
-            "known": True,
-        },
-        # The permittivity of every material but air and metal.
         "parameters": {
-            f"{name}.relative_permittivity": {"bounds": permittivity_bounds(item.relative_permittivity)}
-            for name, item in live.materials.items()
-            if item.relative_permittivity > 1.5
+            f"{name}.relative_permittivity": {"bounds": default} for name, default in bounds.items()
         },
         **sections,
+        # What a section does not state remains that of the scene.
+        "materials": materials | {name: _stated(materials.get(name, {}), own) for name, own in given.items()},
+        "antennas": antennas | {"known": True, **sections.get("antennas", {})},
         "links": {"file": "links.csv", **ends, "value": VALUE, **power, **links},
     }
+
+
+def _stated(constants: Mapping[str, Any], given: Any) -> Any:
+    """The constants of a material in a scene, and those that are given instead, which may be those of ITU-R P.2040."""
+    if not isinstance(given, Mapping):
+        return given
+    law = {"relative_permittivity", "conductivity"} if "itu" in given else set[str]()
+    return {key: value for key, value in constants.items() if key not in law} | dict(given)
 
 
 def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
@@ -26,6 +25,7 @@ from calibray.errors import InputError
 from calibray.materials import SCALAR_CONSTANTS, Material
 from calibray.scenes import Mesh, MeshObject, read_scene
 from calibray.scenes.scene import exported_names
+from calibray.scenes.scene_file import unique_names
 from calibray.scenes.shapes import COARSE, TOO_COARSE
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.tables import hertz
@@ -76,7 +76,10 @@ class LiveScene:
                 "the scene has no transmitter, receiver or antenna array; add them, and set scene.tx_array and "
                 "scene.rx_array"
             )
-        objects = tuple(part for item in live.objects.values() for part in _objects(item))
+        parts = [part for item in live.objects.values() for part in _objects(item)]
+        # Names become file names.
+        names = unique_names(part.name for part in parts)
+        objects = tuple(replace(part, name=name) for part, name in zip(parts, names, strict=True))
         _check_precision(objects)
         return cls(
             _number(live.frequency),
@@ -128,7 +131,7 @@ def _checked(scene: object) -> Any:
 
 
 def _objects(item: Any) -> Iterator[MeshObject]:
-    """The connected surfaces of an object."""
+    """The connected surfaces of an object, whose names differ from those of materials."""
     values = mi.traverse(item.mi_mesh)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
     face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)
@@ -138,13 +141,13 @@ def _objects(item: Any) -> Iterator[MeshObject]:
     ends = face[:, [0, 1, 1, 2]].reshape(-1, 2).T
     links = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(len(position),) * 2)
     count, part = connected_components(links, directed=False)
-    # Names become file names and must differ from material names.
-    name = re.sub(r"[^A-Za-z0-9_-]", "_", item.name)
     for number in np.unique(part[face[:, 0]]).tolist():
         used, faces = np.unique(face[part[face[:, 0]] == number], return_inverse=True)
         suffix = f"-{number}" if count > 1 else ""
         yield MeshObject(
-            f"object-{name}{suffix}", item.radio_material.name, Mesh(position[used], faces.reshape(-1, 3))
+            f"object-{item.name}{suffix}",
+            item.radio_material.name,
+            Mesh(position[used], faces.reshape(-1, 3)),
         )
 
 
@@ -185,6 +188,11 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
         raise InputError(
             f"scene.{end}_array has {array.array_size} elements; a measured value belongs to one antenna: set an array "
             "of one element with its pattern"
+        )
+    if np.any(np.array(array.normalized_positions)):
+        raise InputError(
+            f"the element of scene.{end}_array is not at the position of the device; move the devices to the positions "
+            "of their elements, and set an array with the element at its centre"
         )
     orientation = np.array([_vector(device.orientation) for device in devices.values()])
     if np.ptp(orientation, axis=0).max() > 1e-6:
