@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import sionna.rt as rt
 
 import planted
 import shown
@@ -81,6 +82,10 @@ def test_the_exported_scene_is_the_one_that_predictions_use(tmp_path: Path) -> N
     for file in (tmp_path / "exported" / "scene.xml", tmp_path / "out" / "result-scene.xml"):
         written = read_scene(file, result.study.scene.frequency).materials[exported]
         assert getattr(written, constant) == pytest.approx(value * 1.25, rel=1e-6)
+    scene = rt.load_scene(rt.scene.simple_street_canyon)
+    changed.apply(scene)
+    live = np.array(getattr(scene.radio_materials[material], constant)).item()
+    assert live == pytest.approx(value * 1.25, rel=1e-6)
     loaded = Result.load(tmp_path / "out")
     links = planted.links()
     assert np.abs(loaded.predict(links) - result.predict(links)).max() > 0.01

@@ -185,17 +185,18 @@ class Result(Record):
         return report(self, file, overwrite=overwrite, progress=progress)
 
     def apply(self, scene: object) -> None:
-        """Set the calibrated materials in a `sionna.rt.Scene` in memory, at the study's carrier.
+        """Set the materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
-        If the scene has a different carrier, a warning states both carriers. Unlike the constants of ITU materials, the
-        calibrated constants do not change when `scene.frequency` is set.
+        These are `scene_materials`, as in exports: those of the prediction model if blocks were held out, otherwise the
+        calibrated ones. If the scene has a different carrier, a warning states both carriers. Unlike the constants of
+        ITU materials, these constants do not change when `scene.frequency` is set.
 
         Raises:
             InputError: The object is not a Sionna RT scene, or the scene lacks a material.
         """
         from calibray.tracing.sionna.live_scene import apply_materials
 
-        apply_materials(scene, self.materials, self.study.scene.frequency)
+        apply_materials(scene, self.scene_materials, self.study.scene.frequency)
 
     def export(
         self,
