@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 
 import calibray as cb
-from calibray.errors import InputError
+from calibray import engines
+from calibray.errors import EngineError, InputError
 from calibray.scenarios import demo_study_path
 from shown import GOLDEN
 
@@ -94,6 +95,70 @@ def test_arguments_of_a_calibration(study: cb.Study, arguments: dict, message: s
     refused(message, lambda: cb.calibrate(study, **arguments))
 
 
+def test_workers_are_opened(study: cb.Study, result: cb.Result) -> None:
+    place = {"half": "west"}
+    calls: tuple[Callable[[], object], ...] = (
+        lambda: cb.validate(study, blocks=3, workers=2),
+        lambda: engines.make(study, workers=2),
+        lambda: result.coverage_map([0, 0, 12], cell=50, columns=place, workers=2),
+    )
+    for call in calls:
+        refused(r"workers: is 2, must be workers from engines\.open_workers", call)
+    for number in ("2", 1.5, True, 0):
+        with pytest.raises(InputError, match=r"workers: is .*, must be a whole number"):
+            engines.open_workers(number).__enter__()
+    with pytest.raises(InputError, match=r"scheduler: is 5, must be an address"):
+        engines.open_workers(scheduler=5).__enter__()
+
+
+@pytest.mark.parametrize("samples", [0, -1, True, 2.5, "many"])
+def test_a_number_of_rays(result: cb.Result, samples: Any) -> None:
+    refused(
+        "samples: is .*, must be a number of rays",
+        lambda: result.coverage_map([0, 0, 12], cell=50, columns={"half": "west"}, samples=samples),
+    )
+
+
+def test_numbers_of_numpy_are_numbers(study: cb.Study) -> None:
+    content = study.content()
+    content["trace"]["max_depth"] = np.int64(3)
+    name = next(iter(content["parameters"]))
+    content["parameters"][name]["bounds"] = np.array([1.5, 9.0])
+    content["method"]["seed"] = np.uint8(7)
+    converted = cb.Study.from_content(content)
+    assert (converted.trace.max_depth, converted.method.seed) == (3, 7)
+    assert converted.parameters[name].bounds == (1.5, 9.0)
+    assert study.replace(seed=np.int64(7)).method.seed == 7
+
+
+class Answers:
+    """An engine that returns what a function makes of the true path loss."""
+
+    def __init__(self, study: cb.Study, change: Callable[[np.ndarray], Any]) -> None:
+        self._engine, self._change = engines.make(study), change
+        self.parameters, self.materials, self.calls = self._engine.parameters, self._engine.materials, 0
+
+    def path_loss(self, candidates: np.ndarray) -> Any:
+        self.calls += len(candidates)
+        return self._change(self._engine.path_loss(candidates))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda loss: None, "Answers returned a NoneType from path_loss; must be a NumPy array"),
+        (lambda loss: loss.tolist(), "returned a list from path_loss"),
+        (lambda loss: np.vstack([loss, loss]), r"shape \(2, .*with 1 rows"),
+        (lambda loss: loss[:, 1:], "returned path loss of .* links, must be"),
+        (lambda loss: np.where(np.arange(loss.shape[1]) == 3, np.nan, loss), "NaN or -inf .* of link 3"),
+        (lambda loss: loss + 0j, "type complex128"),
+    ],
+)
+def test_what_an_engine_returns(study: cb.Study, change: Callable[[np.ndarray], Any], message: str) -> None:
+    with pytest.raises(EngineError, match=message):
+        cb.calibrate(study.replace(method="gwo"), engine=Answers(study, change))
+
+
 def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Paths) -> None:
     table = pd.DataFrame({"rx_x": [1.0]})
     for value in (None, "study.toml"):
@@ -108,7 +173,12 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
         lambda: cb.trace("sionna:munich", table, frequency=3e9),
     )
     refused(r"not a pandas\.DataFrame; use read_measurements", lambda: cb.trace(study, table))
-    refused("frequency = '3e9': must be a finite number", lambda: cb.itu_material("concrete", "3e9"))
+    for frequency in ("3e9", 3.5):
+        refused(
+            f"frequency = {frequency!r}: must be in .* write 28.5 GHz as 28.5e9",
+            lambda frequency=frequency: cb.itu_material("concrete", frequency),
+        )
+    refused("conductivity: follows from ITU-R", lambda: cb.itu_material("concrete", 3e9, conductivity=1.0))
     refused("frequency = '3e9': must be in 1e", lambda: paths.at("3e9"))
     name = next(iter(paths.materials))
     refused(f"material '{name}': is 5, must be a Material", lambda: cb.path_loss(paths, {name: 5}))

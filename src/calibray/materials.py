@@ -313,6 +313,8 @@ def itu_material(
         >>> itu_material("concrete", frequency=4e9, revision="P.2040-1").relative_permittivity
         5.31
     """
+    if stated := scattering.keys() & {"relative_permittivity", "conductivity"}:
+        raise InputError(f"{min(stated)}: follows from ITU-R P.2040; use Material to give it instead")
     law = itu_law(name, frequency, revision)
     frequency_ghz = frequency / 1e9
     return Material(
@@ -335,9 +337,7 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
     """
     if revision not in ITU_MATERIALS:
         raise InputError(f"revision = {revision!r}: unknown, {did_you_mean(revision, ITU_MATERIALS)}")
-    if not (isinstance(frequency, Real) and isfinite(frequency) and frequency > 0):
-        raise InputError(f"frequency = {frequency!r}: must be a finite number greater than 0 Hz")
-    table = ITU_MATERIALS[revision]
+    frequency, table = check_frequency(frequency), ITU_MATERIALS[revision]
     if name not in table:
         others = [other for other in ITU_MATERIALS if name in ITU_MATERIALS[other]]
         remedy = f"it is in {', '.join(others)}" if others else did_you_mean(name, table)

@@ -341,7 +341,8 @@ def test_invalid_positions_are_refused(house: Tracer, tx: list, rx: list, messag
         ({"frequency": float("nan")}, r"frequency = nan: must be"),
         ({"tx_antenna": {"pattern": "yagi"}}, r"antenna pattern = 'yagi': must be one of iso, dipole"),
         ({"rx_antenna": {"polarization": "R"}}, r"antenna polarization = 'R': must be one of V, H"),
-        ({"rx_antenna": {"gain": 3}}, r"antenna: unknown key 'gain'; known: pattern"),
+        ({"rx_antenna": {"gain": 3}}, r"rx_antenna: unknown key 'gain'; known: pattern"),
+        ({"tx_antenna": "dipole"}, r"tx_antenna: is 'dipole', must be an Antenna or its attributes"),
         ({"rx_antenna": {"orientation": [0, 1]}}, r"antenna orientation = .*must be three angles"),
         ({"rx_antenna": {"orientation": ["a", 0, 0]}}, r"antenna orientation = .*must be three angles"),
         (

@@ -17,7 +17,7 @@ from calibray.calibration.link_diagnostics import (
 )
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
-from calibray.engines.cluster.workers import Workers
+from calibray.engines.cluster.workers import Workers, check_workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Answering, Engine
 from calibray.engines.rays.export import Exporting
@@ -99,8 +99,7 @@ def calibrate(
             f"engine: is {engine!r}, must be an engine for all links; to choose one by name, use "
             "study.replace(engine=NAME)"
         )
-    if not isinstance(workers, Workers | None):
-        raise InputError(f"workers: is {workers!r}, must be workers from engines.open_workers(NUMBER)")
+    check_workers(workers)
     if not isinstance(cheap_model, Study | Setup | None):
         raise InputError(f"cheap_model: is {cheap_model!r}, must be a Study, such as Study.load(file)")
     replaced = study.replace(method=method, seed=seed)

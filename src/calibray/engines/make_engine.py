@@ -7,9 +7,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 from xml.etree import ElementTree
 
+from calibray.engines.cluster.workers import Workers, check_workers
 from calibray.engines.kinds import KINDS
 from calibray.engines.ledger.ledger import Ledger
 from calibray.engines.ledger.recorded import Recorded
@@ -21,9 +22,6 @@ from calibray.paths import Paths
 from calibray.scenes import Scene
 from calibray.support.progress import Progress
 from calibray.tracing.cache import mesh_files
-
-if TYPE_CHECKING:
-    from calibray.engines.cluster.workers import Workers
 
 
 def make(
@@ -53,6 +51,7 @@ def make(
         InputError: The engine is unknown, does not suit the study, or does not support workers; the ledger cannot be
             used; or the study's scene, links or parameters cannot be used.
     """
+    check_workers(workers)
     opened = study.opened()
     name = opened.engine.name if name is None else name
     if name not in KINDS:

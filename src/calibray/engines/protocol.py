@@ -305,11 +305,33 @@ class Observable:
     ) = None
 
 
+def _path_loss(engine: Engine, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Path loss [n, L], [dB], of any engine.
+
+    Raises:
+        EngineError: The answer is not an array of numbers with one row per candidate, or a number is NaN or -inf.
+    """
+    loss, count = engine.path_loss(candidates), len(candidates)
+    if not isinstance(loss, np.ndarray) or loss.ndim != 2 or len(loss) != count or loss.dtype.kind != "f":
+        shape = f" of shape {loss.shape} and type {loss.dtype}" if isinstance(loss, np.ndarray) else ""
+        raise EngineError(
+            f"the engine {type(engine).__name__} returned a {type(loss).__name__}{shape} from path_loss; must be a "
+            f"NumPy array of floats with {count} rows, one per candidate, and one column per link"
+        )
+    if not (loss > -np.inf).all():
+        link = int(np.flatnonzero(~(loss > -np.inf).all(axis=0))[0])
+        raise EngineError(
+            f"the engine {type(engine).__name__} returned NaN or -inf for the path loss of link {link}, counted from "
+            "0; return inf for a link without a path"
+        )
+    return loss
+
+
 PATH_LOSS: Final = Observable(
     "path loss",
     "dB",
     measured=lambda links: links.path_loss_db,
-    modelled=lambda engine, candidates: engine.path_loss(candidates),
+    modelled=_path_loss,
     derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
 )
 """Path loss [dB], the observable that the paper uses for calibration."""

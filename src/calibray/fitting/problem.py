@@ -19,7 +19,7 @@ from calibray.engines.protocol import (
     Reduced,
     Responses,
 )
-from calibray.errors import InputError
+from calibray.errors import EngineError, InputError
 from calibray.fitting.nuisance import study_nuisance
 from calibray.fitting.objective import Objective, Share, make_objective, rows, total
 from calibray.fitting.observed import Observed, observed
@@ -106,6 +106,7 @@ class Problem:
 
         Raises:
             InputError: No calibration link is left, or a group has only held-out links.
+            EngineError: The engine's answer has not one finite or infinite value per link.
         """
         setup = setup.with_position_noise()
         study, links, held_out = setup.study, setup.links, setup.held_out
@@ -116,6 +117,11 @@ class Problem:
             before = engine.respond(engine.parameters.start[None], statistics).path_loss[0]
         else:
             before = observable.modelled(engine, engine.parameters.start[None])[0]
+        if before.shape != (len(links),):
+            raise EngineError(
+                f"the engine {type(engine).__name__} returned path loss of {before.size} links, must be {len(links)}: "
+                "all links of the study, including held-out links"
+            )
         censored = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
         objective = make_objective(
             links,

@@ -277,8 +277,10 @@ def start_value(
     return float(start)
 
 
-def itu_start(name: str, start: str, frequency: float) -> float:
+def itu_start(name: str, start: str, frequency: float, key: str = "start") -> float:
     """Look up the ITU-R P.2040 value for a start value such as "itu:concrete@P.2040-1", in the unit of the field.
+
+    Messages name the `key` of the study that states the value.
 
     Raises:
         InputError: The text has a different form, the field has no ITU-R law, or `itu_material` raises the error.
@@ -288,17 +290,17 @@ def itu_start(name: str, start: str, frequency: float) -> float:
         raise InputError(f"{name}: {start!r}: ITU-R P.2040 specifies only materials; give a number")
     if not start.startswith(_ITU_PREFIX):
         raise InputError(
-            f"{name}: start = {start!r}: must be a number or 'itu:NAME', such as 'itu:concrete@P.2040-1'"
+            f"{name}: {key} = {start!r}: must be a number or 'itu:NAME', such as 'itu:concrete@P.2040-1'"
         )
     if CONSTANT_OF_FIELD.get(field) not in LAWS:
-        raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 does not specify {field}; give a number")
+        raise InputError(f"{name}: {key} = {start!r}: ITU-R P.2040 does not specify {field}; give a number")
     itu_name, _, revision = start.removeprefix(_ITU_PREFIX).partition("@")
     try:
         if field not in FIELDS:
             return _coefficient(itu_law(itu_name, frequency, revision or DEFAULT_REVISION), field)
         material = itu_material(itu_name, frequency, revision=revision or DEFAULT_REVISION)
     except InputError as error:
-        raise InputError(f"{name}: start = {start!r}: {error}") from None
+        raise InputError(f"{name}: {key} = {start!r}: {error}") from None
     return float(getattr(material, field))
 
 

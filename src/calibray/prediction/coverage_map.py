@@ -11,14 +11,14 @@ import logging
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Final, Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.engines.cluster.workers import Workers
+from calibray.engines.cluster.workers import Workers, check_workers
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE, position_columns
@@ -85,7 +85,12 @@ def coverage_map(
             `Result.predict_interval` refuses the links.
         EngineError: The paths do not fit into memory.
     """
+    check_workers(workers)
     if samples is not None:
+        if isinstance(samples, bool) or not (
+            samples == "auto" or (isinstance(samples, Integral) and samples > 0)
+        ):
+            raise InputError(f"samples: is {samples!r}, must be a number of rays, at least 1, or 'auto'")
         content = result.study.content()
         content["trace"]["samples"] = samples
         result = replace(result, study=Study.from_content(content, result.study.path))

@@ -113,7 +113,7 @@ class ParameterSection(Section):
             raise InputError(f"{name}: has no prior")
         value = self.prior.value if self.prior.like is None else 1.0
         if value is None:
-            value = itu_start(name, f"itu:{self.prior.itu}", frequency)
+            value = itu_start(name, f"itu:{self.prior.itu}", frequency, "prior.itu")
         if not min(value, self.bounds[0]) > 0:
             raise InputError(
                 f"{name}: a log-normal prior needs a positive value and a positive lower bound, but these are "

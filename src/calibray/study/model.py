@@ -78,7 +78,7 @@ class StudyModel(StudyContent, ABC):
         content = {**content, "engine": engine}
         try:
             # From JSON, a list is accepted as a tuple, but nothing else is converted: "4" is not a number.
-            text = json.dumps(content, default=str)
+            text = json.dumps(content, default=_plain)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
         try:
@@ -406,6 +406,11 @@ class StudyModel(StudyContent, ABC):
         if engine is not None:
             content["engine"]["name"] = engine
         return type(self).from_content(content, self._path)
+
+
+def _plain(value: object) -> Any:
+    """Numbers and arrays of NumPy as those of Python, and all else as text."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def _keys_without_effect(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

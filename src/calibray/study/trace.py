@@ -100,7 +100,7 @@ def trace(
         complete = _complete(materials or {}, "a scene already read")
     else:
         scene = read_scene(scene, frequency, materials)
-    antennas = as_antenna(tx_antenna), as_antenna(rx_antenna)
+    antennas = as_antenna(tx_antenna, "tx_antenna"), as_antenna(rx_antenna, "rx_antenna")
     names = TraceSettings().record()
     if unknown := set(settings) - set(names):
         raise InputError(f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(names)}")

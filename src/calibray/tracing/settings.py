@@ -184,19 +184,25 @@ class Antenna:
         return record
 
 
-def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
+def as_antenna(value: Antenna | Mapping[str, object] | None, name: str = "antenna") -> Antenna:
     """Make an antenna from a mapping of its attributes or from None (the default); an antenna is returned unchanged.
 
+    Error messages call it `name`.
+
     Raises:
-        InputError: A key or value is unknown.
+        InputError: The value is neither, or a key or value is unknown.
     """
     if value is None:
         return Antenna()
     if isinstance(value, Antenna):
         return value
+    if not isinstance(value, Mapping):
+        raise InputError(
+            f"{name}: is {shortened(repr(value))}, must be an Antenna or its attributes, such as "
+            '{"pattern": "dipole"}'
+        )
     unknown = set(value) - {field.name for field in fields(Antenna)}
     if unknown:
-        raise InputError(
-            f"antenna: unknown key {sorted(unknown)[0]!r}; known: {', '.join(field.name for field in fields(Antenna))}"
-        )
+        known = ", ".join(field.name for field in fields(Antenna))
+        raise InputError(f"{name}: unknown key {min(unknown, key=str)!r}; known: {known}")
     return Antenna(**value)  # type: ignore[arg-type]

@@ -31,6 +31,7 @@ from calibray.engines.cluster.dask_workers import POLL, Answered, DaskWorkers, c
 from calibray.errors import EngineError, InputError
 from calibray.support.cache_folder import cache_folder
 from calibray.support.memory import available_memory
+from calibray.support.messages import shortened
 
 ALWAYS_ALLOWED: Final = 8
 """Number of worker processes that are allowed on any machine, even one with few cores."""
@@ -392,6 +393,18 @@ def _pin(home: int, count: int) -> None:
         os.sched_setaffinity(0, cores[home % count :: count] or cores)
 
 
+def check_workers(workers: object) -> None:
+    """Refuse anything but workers or None.
+
+    Raises:
+        InputError: It is something else, such as a number.
+    """
+    if not isinstance(workers, Workers | None):
+        raise InputError(
+            f"workers: is {shortened(repr(workers))}, must be workers from engines.open_workers(NUMBER)"
+        )
+
+
 @contextmanager
 def open_workers(workers: int | None = None, scheduler: str | None = None) -> Iterator[Workers | None]:
     """Open workers for `engines.make`, `calibrate`, `validate` and predictions, and close them at the end.
@@ -410,8 +423,10 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
     """
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: give only one of the two; a cluster has its own workers")
-    if workers is not None and workers < 1:
-        raise InputError(f"--workers {workers}: must be at least 1")
+    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
+        raise InputError(f"workers: is {workers!r}, must be a whole number, at least 1")
+    if not isinstance(scheduler, str | None):
+        raise InputError(f"scheduler: is {scheduler!r}, must be an address such as 'tcp://10.0.0.1:8786'")
     with ExitStack() as opened:
         if scheduler is not None:
             client = opened.enter_context(scheduler_client(scheduler))
