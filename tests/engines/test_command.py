@@ -249,10 +249,12 @@ def test_a_result_that_is_worse_than_the_initial_values_says_so(tmp_path, away, 
     for name, value in zip(planted.TRUTH, programs.TRUTH + away, strict=True):
         content["parameters"][name] = {"bounds": planted.BOUNDS, "start": float(value)}
     result = calibrate(Study.from_content(content, tmp_path / "study.toml"))
-    assert (result.rmse_db > result.initial_rmse_db) == worse
+    assert (result.history.rmse_db.min() > result.initial_rmse_db) == worse
+    assert (result.rmse_db == result.initial_rmse_db) == worse
     remarks = [text for text in result.remarks if "did not improve on the initial values" in text]
     assert len(remarks) == worse
     assert all(f"an RMSE of {result.initial_rmse_db:.2f} dB" in text for text in remarks)
+    assert all("The result has the initial values." in text for text in remarks)
     assert all(
         text.endswith("Use a larger budget (method.options), or the method 'auto'.") for text in remarks
     )

@@ -230,10 +230,11 @@ def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float
     if (
         study.observables
         or any(prior is not None for prior in priors)
-        or not trail.best_rmse_db > start + WORSE_DB
+        or not (found := min(trail.rmse_db)) > start + WORSE_DB
     ):
         return ()
-    values = {"start_db": start, "found_db": trail.best_rmse_db, "method": study.method.name}
+    kept = bool(trail.best_rmse_db < found)
+    values = {"start_db": start, "found_db": found, "method": study.method.name, "kept": kept}
     return (Remark(RemarkKind.WORSE_THAN_START, values),)
 
 

@@ -119,7 +119,7 @@ class RemarkKind(StrEnum):
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight
     UNDECLARED_OFFSET = "undeclared offset"  # offset_db, error_db, rmse_db, rmse_without_db
     MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db
-    WORSE_THAN_START = "worse than start"  # start_db, found_db, method: its name
+    WORSE_THAN_START = "worse than start"  # start_db, found_db, method: its name, kept
     # names, values, pieces (lower and upper ends in turn), most_probable, cause, odds, blocks
     OUTSIDE_INTERVAL = "outside interval"
     FEW_DRAWS = "few draws"

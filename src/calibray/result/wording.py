@@ -375,9 +375,11 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     ),
     RemarkKind.WORSE_THAN_START: lambda values: (
         f"The method did not improve on the initial values: they have an RMSE of {values['start_db']:.2f} dB, and the "
-        f"best candidate of the method has {values['found_db']:.2f} dB. Do not use the result. Use a larger budget "
+        f"best candidate of the method has {values['found_db']:.2f} dB. "
+        + ("The result has the initial values. " if values.get("kept") else "Do not use the result. ")
         # Results of earlier versions do not name the method.
-        "(method.options)" + ("." if values.get("method") == "auto" else ", or the method 'auto'.")
+        + "Use a larger budget (method.options)"
+        + ("." if values.get("method") == "auto" else ", or the method 'auto'.")
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (

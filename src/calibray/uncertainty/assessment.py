@@ -131,8 +131,10 @@ def _assess_emulated(
     ensemble, name = emulate(problem, trail, model), problem.setup.study.engine.name
     error_db = np.inf if ensemble is None else float(ensemble.error_db)
     if ensemble is None or error_db > LARGEST_ERROR * trail.best_value:
-        error = {} if ensemble is None else {"error_db": error_db, "rmse_db": trail.best_value}
-        reason = Reason(ReasonKind.TOO_FEW_CALLS, {"calls": len(trail.candidates)} | error)
+        values: dict[str, float | int | str] = {"calls": len(trail.candidates)}
+        if ensemble is not None:
+            values |= {"error_db": error_db, "rmse_db": trail.best_value}
+        reason = Reason(ReasonKind.TOO_FEW_CALLS, values)
         intervals = _full_ranges(problem.parameters, reason)
         return Certainty(Uncertainty(_approximate(intervals))), 0
     mean, *drawn = (

@@ -423,8 +423,10 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
     """
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: give only one of the two; a cluster has its own workers")
-    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
-        raise InputError(f"workers: is {workers!r}, must be a whole number, at least 1")
+    if isinstance(workers, bool) or not isinstance(workers, int | None):
+        raise InputError(f"workers: is {workers!r}, must be a whole number")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers {workers}: must be at least 1")
     if not isinstance(scheduler, str | None):
         raise InputError(f"scheduler: is {scheduler!r}, must be an address such as 'tcp://10.0.0.1:8786'")
     with ExitStack() as opened:
