@@ -356,9 +356,9 @@ def test_a_failure_does_not_lose_the_others(tmp_path):
 
 
 class DyingWorkers(ThreadPoolExecutor):
-    """Workers of which the one on the second call dies."""
+    """Workers of which the one on the second call dies; they keep no chunks."""
 
-    submitted = 0
+    submitted, keep, ask = 0, None, None
 
     def executor(self):
         return self

@@ -290,7 +290,7 @@ def test_the_group_is_that_of_the_links_measured_at_the_transmitter(result, monk
         ({"tx": "mast"}, "tx = 'mast': must be x, y and z"),
         ({"bounds": "scene"}, "bounds = 'scene': must be west, south, east and north"),
         ({"level": 1.5}, r"level = 1\.5"),
-        ({"samples": 0}, "trace.samples"),
+        ({"samples": 0}, "samples: is 0, must be a number of rays"),
         ({"columns": {}}, "--column half=VALUE"),
     ],
 )

@@ -50,6 +50,9 @@ drawn. With larger errors, candidates near a call fit better only because the em
 limit, the sets contained 10 of 20 values called identified or weakly identified (15 runs with 2 to 16 calls per
 parameter), and with smaller errors 18 of 25 (14 runs)."""
 
+NEGLIGIBLE_DB: Final = 0.05
+"""Error of an emulator that is always accepted [dB]; path loss is not measured more precisely."""
+
 EQUAL: Final = 0.1
 """If the drawn emulators differ from their mean by less than this share of the lowest objective, only the mean is
 used."""
@@ -130,7 +133,7 @@ def _assess_emulated(
     """Uncertainty from emulators of an engine without derivatives, and the number of replays."""
     ensemble, name = emulate(problem, trail, model), problem.setup.study.engine.name
     error_db = np.inf if ensemble is None else float(ensemble.error_db)
-    if ensemble is None or error_db > LARGEST_ERROR * trail.best_value:
+    if ensemble is None or error_db > max(LARGEST_ERROR * trail.best_value, NEGLIGIBLE_DB):
         values: dict[str, float | int | str] = {"calls": len(trail.candidates)}
         if ensemble is not None:
             values |= {"error_db": error_db, "rmse_db": trail.best_value}
