@@ -358,7 +358,8 @@ def test_a_failure_does_not_lose_the_others(tmp_path):
 class DyingWorkers(ThreadPoolExecutor):
     """Workers of which the one on the second call dies; they keep no chunks."""
 
-    submitted, keep, ask = 0, None, None
+    submitted = 0
+    keep = ask = ThreadPoolExecutor.submit
 
     def executor(self):
         return self
