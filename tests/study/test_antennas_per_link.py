@@ -16,6 +16,7 @@ from calibray import engines
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable
+from calibray.prediction.coverage_map import _column_values
 from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
@@ -326,3 +327,18 @@ def test_directions_have_gaussian_priors_and_materials_have_not(planted: Study) 
     assert (study.priors.spread, study.priors.linear) == ((5.0,), (1,))
     with pytest.raises(InputError, match=r"prior.std is for antennas"):
         misdirected(planted, **{"ground.conductivity": {"bounds": [0.1, 2.0], "prior": {"std": 0.1}}})
+
+
+def test_an_empty_bearing_of_an_omnidirectional_antenna_counts_as_zero(planted: Study) -> None:
+    """Also in the links of a map, which takes it from the links measured at the transmitter."""
+    sites = SITES.assign(remote_tilt=0.0)
+    sites.loc[sites["antenna"] == "rod", ["bearing", "tilt"]] = np.nan
+    sites.to_csv(planted.path.parent / "gaps.csv", index=False)
+    study = mounted(planted, transmitters="gaps.csv")
+    result = cb.calibrate(study, tracer=TwoRay)
+    assert result.parameters["ground.relative_permittivity"] == pytest.approx(TRUTH, rel=1e-6)
+    columns = _column_values(result, np.array([40.0, 0.0, 10.0]), {"transmitter": "omni"})
+    assert np.isnan([columns["bearing"], columns["tilt"]]).all()
+    sites.assign(antenna="sector").to_csv(planted.path.parent / "gaps.csv", index=False)
+    with pytest.raises(InputError, match=r"column 'bearing' is missing or not finite for transmitter omni"):
+        Setup.open(study, tracer=TwoRay).mountings  # noqa: B018

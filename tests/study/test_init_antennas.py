@@ -159,7 +159,7 @@ def test_files_are_matched_by_name_and_hold_the_electrical_tilt(scene, tmp_path,
 def test_a_missing_file_or_angle_is_named(scene, tmp_path, files):
     (files / "K80010677_06T.MSI").unlink()
     with pytest.raises(
-        InputError, match=r"no file for 'k80010677_06t' of column 'Antenna Model'.*rename the files"
+        InputError, match=r"no file for 'k80010677_06t' of column 'Antenna Model'.*give the name of a file"
     ):
         drafted(scene, tmp_path, SECTORS, antennas=files)
     with pytest.raises(InputError, match=r"contains no file \*.msi"):
@@ -170,6 +170,50 @@ def test_a_missing_file_or_angle_is_named(scene, tmp_path, files):
     assert "1 of 2 rows contain no number" in reasons["links.tx_antenna.azimuth_deg"]
     assert "200 is not an angle" in reasons["links.tx_antenna.downtilt_deg"]
     assert found.study.links.tx_antenna.azimuth_deg is None
+
+
+ROD = "NAME rod\nGAIN 5 dBi\nHORIZONTAL 360\n" + "".join(f"{angle} 0.3\n" for angle in range(360))
+ROD += "VERTICAL 360\n" + "".join(f"{angle} {min(angle % 180, 20)}\n" for angle in range(360))
+
+
+@pytest.mark.parametrize("omnidirectional", ["rod", "dipole"])
+def test_empty_angles_of_omnidirectional_antennas_count_as_zero(scene, tmp_path, files, omnidirectional):
+    """Planning tools leave them empty; the sector keeps its azimuth."""
+    (files / "rod.msi").write_text(ROD)
+    sites = SECTORS.assign(Azimuth=[20.0, None], MTilt=[2.0, None])
+    sites["Antenna Model"] = ["K80010677 03T", omnidirectional]
+    found = drafted(scene, tmp_path, sites, antennas=files)
+    section = found.study.links.tx_antenna
+    assert (section.azimuth_deg, section.downtilt_deg) == ("Cell_Azimuth", "MTilt")
+    pose = Setup.open(found.study).mountings["tx"].pose
+    assert np.degrees(np.unique(pose.yaw)) == pytest.approx([70.0, 90.0])
+    assert np.degrees(np.unique(pose.downtilt)) == pytest.approx([0.0, 2.0])
+    reasons = {each.what: each.reason for each in found.assumptions}
+    assert ("except dipole" in reasons["links.tx_antenna.type"]) == (omnidirectional == "dipole")
+
+
+def test_directional_antennas_without_an_angle_are_named(scene, tmp_path, files, caplog):
+    with pytest.raises(
+        InputError, match=r"sites.csv: column 'Cell_Azimuth' in row 3 contains no number; write"
+    ):
+        drafted(scene, tmp_path, SECTORS.assign(Azimuth=[20.0, None]), antennas=files)
+    assert not caplog.messages
+    drafted(scene, tmp_path, SECTORS.drop(columns="Azimuth"), antennas=files)
+    assert "no azimuths, so directional antennas point east" in caplog.text
+    # A column without any angle states nothing.
+    found = drafted(scene, tmp_path, SECTORS.assign(MTilt=np.nan), antennas=files)
+    assert found.study.links.tx_antenna.downtilt_deg == 0.0
+
+
+def test_unnamed_antennas_are_refused_with_the_names_of_omnidirectional_ones(scene, tmp_path, files):
+    sites = SECTORS.copy()
+    sites["Antenna Model"] = ["K80010677 03T", None]
+    remedy = "give the name of a file, or 'iso' or 'dipole' for an omnidirectional antenna"
+    with pytest.raises(InputError, match=rf"column 'Antenna Model' in row 3 is empty; {remedy}"):
+        drafted(scene, tmp_path, sites, antennas=files)
+    sites["Antenna Model"] = ["K80010677 03T", "OMNI"]
+    with pytest.raises(InputError, match=rf"no file for 'OMNI' .*{remedy}"):
+        drafted(scene, tmp_path, sites, antennas=files)
 
 
 def test_reference_signals_do_not_take_the_power_of_the_whole_carrier(scene, tmp_path):

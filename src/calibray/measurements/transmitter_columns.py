@@ -10,7 +10,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.column_names import WATTS, is_named_value, matches, numeric_columns, words
@@ -221,10 +223,19 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
     return {key: columns[0] for key, columns in columns_of.items() if columns}
 
 
-def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
-    """The reason why a column cannot contain the angles of the transmitters; empty if it can."""
+def lacks_angle(column: pd.Series, may_be_empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask [rows] of the cells without a number, except empty cells of rows that may be empty [rows]."""
+    lacking = pd.to_numeric(column, errors="coerce").isna() & ~(column.isna() & may_be_empty)
+    return lacking.to_numpy(bool)
+
+
+def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.bool_]) -> str:
+    """The reason why a column cannot contain the angles of the transmitters; empty if it can.
+
+    `lacking` is the result of `lacks_angle`.
+    """
     values = pd.to_numeric(frame[column], errors="coerce")
-    missing = int(values.isna().sum())
+    missing = len(frame) if values.isna().all() else int(lacking.sum())
     if missing or column not in numeric_columns(frame):
         return f"{missing or len(frame)} of {len(frame)} rows contain no number; add the numbers and state the key"
     if values.abs().max() > LARGEST_ANGLE[key]:

@@ -236,7 +236,7 @@ def _measured_values(
     return {
         name: measured[name].iloc[0]
         for name in columns
-        if name not in stated and name in measured and measured[name].nunique() == 1
+        if name not in stated and name in measured and measured[name].nunique(dropna=False) == 1
     }
 
 

@@ -6,6 +6,7 @@ Names of columns, groups and files are user input. `study_text` quotes these nam
 from __future__ import annotations
 
 import json
+import logging
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
@@ -27,12 +29,17 @@ from calibray.study.calibration_sections import DEFAULT_BLOCKS
 from calibray.study.content import BUNDLED, VERSION
 from calibray.study.draft_links import Assumption, Given, LinksDraft
 from calibray.study.link_checks import CELL_SHARE, LINKS_PER_UNKNOWN, count_unknowns
+from calibray.study.mounting import is_omnidirectional
 from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import Study, permittivity_bounds
 from calibray.study.toml_file import study_text
 from calibray.support.messages import shortened
 from calibray.support.output_files import exists
+from calibray.tables import rows_text
 from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table
+from calibray.tracing.settings import PATTERNS, Antenna
+
+_LOG: Final = logging.getLogger(__name__)
 
 AVERAGING_WAVELENGTHS: Final = 40
 """Width of the cells over which fading is averaged [wavelengths] (Lee 1985; see `calibray.measurements.reading`)."""
@@ -409,23 +416,32 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     frame, of_transmitters = links.transmitter_rows, links.given.transmitters is not None
     mount: dict[str, str] = {}
     antennas: dict[str, Any] = {"tx": dict(UNKNOWN), "rx": dict(UNKNOWN)}
+    omnidirectional = np.zeros(len(frame), dtype=bool)
     if folder is not None:
-        antennas |= _patterns(links, folder, mount)
+        patterns, omnidirectional = _patterns(links, folder, mount)
+        antennas |= patterns
     for key, column in transmitter_columns.find_angles(frame, of_transmitters).items():
-        cause = transmitter_columns.unusable(frame, key, column)
-        if (
-            not cause
-            and folder is not None
-            and key.startswith("electrical")
-            and not matches(column, "additional")
-        ):
+        if folder is not None and key.startswith("electrical") and not matches(column, "additional"):
             cause = "it is included in the vertical cuts of the files"
+        else:
+            lacking = transmitter_columns.lacks_angle(frame[column], may_be_empty=omnidirectional)
+            if folder is not None and lacking.any() and frame[column].notna().any():
+                raise InputError(
+                    f"{_cells(links, column, lacking)} contains no number; write the angle [deg]; only cells of "
+                    "omnidirectional antennas can be empty"
+                )
+            cause = transmitter_columns.unusable(frame, key, column, lacking)
         if cause:
             links.assume(f"links.tx_antenna.{key}", "none", f"column {column}: {cause}")
             continue
         mount[key] = column
         low, high = frame[column].min(), frame[column].max()
         links.assume(f"links.tx_antenna.{key}", column, f"by its name, {low:g} to {high:g} degrees")
+    if "azimuth_deg" not in mount and folder is not None and not omnidirectional.all():
+        _LOG.warning(
+            "%s: no azimuths, so directional antennas point east; add a column 'azimuth' [deg], clockwise from north",
+            links.transmitter_table.source,
+        )
     if folder is None and "azimuth_deg" in mount:
         antennas["tx"]["pattern"] = "tr38901"
     if mount:
@@ -452,8 +468,17 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     return antennas
 
 
-def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[str, Any]:
-    """Antennas with the files named in a column of the transmitters; a single file is used for all transmitters."""
+def _patterns(
+    links: LinksDraft, folder: Path, mount: dict[str, str]
+) -> tuple[dict[str, Any], NDArray[np.bool_]]:
+    """The antennas named in a column of the transmitters, and whether the antenna of each row is omnidirectional.
+
+    A name is that of a file in the folder or of a pattern of Sionna RT. A single file is used for all transmitters.
+
+    Raises:
+        InputError: The folder cannot be used, or an antenna is not named or has no file.
+    """
+    rows = links.transmitter_rows
     try:
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in TWO_CUT_SUFFIXES)
     except OSError as error:
@@ -462,33 +487,49 @@ def _patterns(links: LinksDraft, folder: Path, mount: dict[str, str]) -> dict[st
         raise InputError(
             f"--antennas {folder}: contains no file *.msi, *.pln or *.ant; export the antennas to this folder"
         )
-    by_name = {plain_name(file.name): file for file in files}
-    column = transmitter_columns.find_antenna_names(links.transmitter_rows, by_name)
+    by_name: dict[str, Path | str] = {plain_name(file.name): file for file in files}
+    column = transmitter_columns.find_antenna_names(rows, by_name)
     if column is None and len(files) == 1:
-        return {"tx": _antenna(links, files[0])}
+        section = {"tx": _antenna(links, files[0])}
+        return section, np.full(len(rows), is_omnidirectional(Antenna(str(files[0]))))
     if column is None:
         raise InputError(
             f"--antennas {folder}: no column of {links.given.transmitters or links.links} contains the names of the "
             f"antennas; add a column with names such as {files[0].stem!r}, or keep only one file"
         )
-    labels = sorted(links.transmitter_rows[column].astype(str).unique().tolist())
-    lacking = [label for label in labels if plain_name(label) not in by_name]
+    given = "; give the name of a file, or 'iso' or 'dipole' for an omnidirectional antenna"
+    if (empty := rows[column].isna().to_numpy()).any():
+        raise InputError(f"{_cells(links, column, empty)} is empty{given}")
+    labels = sorted(rows[column].astype(str).unique().tolist())
+    named = {label: by_name.get(plain_name(label), label.strip().lower()) for label in labels}
+    lacking = [label for label, name in named.items() if isinstance(name, str) and name not in PATTERNS]
     if lacking:
         raise InputError(
             f"--antennas {folder}: no file for {', '.join(map(repr, lacking[:5]))} of column {column!r}; the files are "
-            f"{', '.join(file.name for file in files[:5])}; rename the files or the antennas"
+            f"{', '.join(file.name for file in files[:5])}{given}"
         )
     mount["type"] = column
-    links.assume(
-        "links.tx_antenna.type", column, f"{len(labels)} antennas, each with a file of the same name"
-    )
-    return {"types": {label: _antenna(links, by_name[plain_name(label)]) for label in labels}}
+    patterns = [label for label, name in named.items() if isinstance(name, str)]
+    reason = f"{len(labels)} antennas, each with a file of the same name"
+    reason += f", except {', '.join(patterns)}" if patterns else ""
+    links.assume("links.tx_antenna.type", column, reason)
+    types = {label: _antenna(links, name) for label, name in named.items()}
+    omnidirectional = {label: is_omnidirectional(Antenna(str(name))) for label, name in named.items()}
+    return {"types": types}, rows[column].astype(str).map(omnidirectional).to_numpy(bool)
 
 
-def _antenna(links: LinksDraft, file: Path) -> dict[str, str]:
-    """An antenna with the pattern of a file; the file must be readable."""
-    read_gain_table(file)
-    return {"pattern": links.relative(file), "polarization": "V"}
+def _cells(links: LinksDraft, column: str, rows: NDArray[np.bool_]) -> str:
+    """The file, column and rows of cells of the transmitters, formatted for messages."""
+    table = links.transmitter_table
+    return f"{table.source}: column {column!r} in {rows_text(table.row[rows].tolist())}"
+
+
+def _antenna(links: LinksDraft, pattern: Path | str) -> dict[str, str]:
+    """An antenna with a pattern of Sionna RT or the pattern of a file; the file must be readable."""
+    if isinstance(pattern, Path):
+        read_gain_table(pattern)
+        pattern = links.relative(pattern)
+    return {"pattern": pattern, "polarization": "V"}
 
 
 def schema_text() -> str:

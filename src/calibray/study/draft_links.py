@@ -20,6 +20,7 @@ from calibray.measurements import (
     TRACK_COLUMNS,
     Measurements,
     Preparation,
+    SourceTable,
     Track,
     column_names,
     read_table,
@@ -145,11 +146,16 @@ class LinksDraft:
         return {"file": file} | ({} if self.given.origin is None else {"origin": list(self.given.origin)})
 
     @property
-    def transmitter_rows(self) -> pd.DataFrame:
+    def transmitter_table(self) -> SourceTable:
         """The table of transmitters, with columns renamed as in the links. Without such a table, the table of links."""
         if self.sites is None:
-            return self.table.frame
-        return self.sites.frame.rename(columns=self._name_in_links)
+            return self.table
+        return replace(self.sites, frame=self.sites.frame.rename(columns=self._name_in_links))
+
+    @property
+    def transmitter_rows(self) -> pd.DataFrame:
+        """The rows of `transmitter_table`."""
+        return self.transmitter_table.frame
 
     def assume(self, what: str, value: object, reason: str) -> None:
         """Record an assumption."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
@@ -53,9 +54,11 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     antennas, index = link_antennas(study, end, links.table)
     away = links.rx - links.tx if end == "tx" else links.tx - links.rx
     limits = {"azimuth_deg": 360, "downtilt_deg": 90, "electrical_downtilt_deg": 90, "steering_deg": 360}
+    without_direction = np.array([is_omnidirectional(antenna) for antenna in antennas])[index]
     degrees = [
-        np.radians(_degrees(links.table, f"links.{end}_antenna.{key}", getattr(section, key) or 0.0, limit))
+        np.radians(_degrees(links.table, f"links.{end}_antenna.{key}", stated, limit, without_direction))
         for key, limit in limits.items()
+        for stated in [getattr(section, key) or 0.0]
     ]
     yaw, downtilt, electrical, steering = degrees
     if section.aim is not None:
@@ -165,7 +168,12 @@ def link_antennas(
     return tuple(types[name] for name in names.tolist()), index.reshape(-1)
 
 
-def _degrees(table: SourceTable, key: str, stated: float | str, limit: int) -> NDArray[np.float64]:
+def _degrees(
+    table: SourceTable, key: str, stated: float | str, limit: int, may_be_empty: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Angles [rows], [deg]. An empty cell in a row that may be empty [rows] counts as 0."""
+    if isinstance(stated, str) and pd.api.types.is_numeric_dtype(column := table.column(stated)):
+        table = table.assign(**{stated: column.mask(column.isna() & may_be_empty, 0.0)})
     values = table.numbers(stated)
     wrong = np.flatnonzero(np.abs(values) > limit)
     if len(wrong):
@@ -205,6 +213,19 @@ def largest_gain_dbi(antenna: Antenna) -> float:
     zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
     # The amplitude of an array can be negative in side lobes.
     return float(20 * np.log10(np.abs(AntennaPattern.of(antenna).amplitude(zenith, azimuth)).max()))
+
+
+def is_omnidirectional(antenna: Antenna) -> bool:
+    """Whether the gain of an antenna varies by at most 3 dB over the directions in the horizontal plane of its mount.
+
+    Example:
+        >>> is_omnidirectional(Antenna("dipole")), is_omnidirectional(Antenna("tr38901"))
+        (True, False)
+    """
+    azimuth = np.radians(np.arange(-180.0, 180.0))
+    direction = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(len(azimuth))])
+    power = (np.abs(AntennaPattern.of(antenna).jones_vectors(direction)) ** 2).sum(axis=(1, 2))
+    return bool(2 * power.min() >= power.max())
 
 
 FIRST_SPREAD: Final = 0.25

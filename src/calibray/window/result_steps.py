@@ -335,7 +335,9 @@ def show_prediction(desk: Desk) -> None:
             words: list[object] = ["map", chosen.value, "--tx", *site()["tx"]]
             words += ["--height", filled(height), "--cell", filled(cell)]
             words += ["--bounds", *desk.area] if desk.area else []
-            words += [f"--column={name}={value}" for name, value in site()["columns"].items()]
+            words += [
+                f"--column={name}={value}" for name, value in site()["columns"].items() if value is not None
+            ]
             desk.start(words)
 
     async def suggest() -> None:
