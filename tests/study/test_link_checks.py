@@ -295,6 +295,20 @@ def test_links_of_another_town_are_refused(town):
         suspicions(town, links().assign(x=links().x + 690_000))
 
 
+def test_transmitters_far_from_the_scene_are_named(town):
+    """One latitude with a typing error, or longitude and latitude swapped in the whole table."""
+    sites = pd.DataFrame({"cell": ["A", "B"], "tx_x": [-5.0, 20.0], "tx_y": [3.0, 111_000.0], "tx_z": 25.0})
+    sites.to_csv(town / "far.csv", index=False)
+    frame = links().assign(cell=["A", "B"] * 30)
+    keys = {"tx": ["tx_x", "tx_y", "tx_z"], "transmitters": "far.csv", "transmitter": "cell"}
+    assert "B is more than" in suspicions(town, frame, links=keys)
+    sites.assign(tx_x=690_000.0).to_csv(town / "far.csv", index=False)
+    with pytest.raises(InputError, match=r"far\.csv: A, B are more than .* check the position"):
+        suspicions(town, frame, links=keys)
+    with pytest.raises(InputError, match=r"csv: the transmitter is more than"):
+        suspicions(town, links(), links={"tx": [690_000.0, 0.0, 25.0]})
+
+
 SUNK = "60 of 60 receivers are below the ground; check heights and their datum"
 
 

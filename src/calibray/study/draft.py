@@ -487,7 +487,7 @@ def _patterns(
         raise InputError(
             f"--antennas {folder}: contains no file *.msi, *.pln or *.ant; export the antennas to this folder"
         )
-    by_name: dict[str, Path | str] = {plain_name(file.name): file for file in files}
+    by_name = {plain_name(file.name): file for file in files}
     column = transmitter_columns.find_antenna_names(rows, by_name)
     if column is None and len(files) == 1:
         section = {"tx": _antenna(links, files[0])}
@@ -501,7 +501,7 @@ def _patterns(
     if (empty := rows[column].isna().to_numpy()).any():
         raise InputError(f"{_cells(links, column, empty)} is empty{given}")
     labels = sorted(rows[column].astype(str).unique().tolist())
-    named = {label: by_name.get(plain_name(label), label.strip().lower()) for label in labels}
+    named = {label: by_name.get(plain_name(label)) or str(label).strip().lower() for label in labels}
     lacking = [label for label, name in named.items() if isinstance(name, str) and name not in PATTERNS]
     if lacking:
         raise InputError(

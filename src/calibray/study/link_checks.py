@@ -1,7 +1,7 @@
 """Checks of links for common mistakes in positions, units and angles, made before tracing.
 
-Each finding is a suspicion supported by evidence, not a proof. An error is raised only if all links are far from the
-scene.
+Each finding is a suspicion supported by evidence, not a proof. An error is raised only if all receivers or all
+transmitters are far from the scene.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from calibray.scenes.obstruction import CLUSTER, cluster_labels
 from calibray.study.calibration_sections import NuisanceSection
 from calibray.study.model import StudyModel
 from calibray.study.mounting import largest_gain_dbi, link_antennas, link_mountings
+from calibray.support.messages import shortened
 from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
@@ -76,8 +77,8 @@ def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     There are no findings if only an external program can read the scene.
 
     Raises:
-        InputError: The engine is not an external program, and either all links are far from the scene or the scene
-            cannot be read.
+        InputError: The engine is not an external program, and either all receivers or transmitters are far from the
+            scene or the scene cannot be read.
     """
     if find_spec("shapely") is None:
         problem = "positions were not checked against the scene: shapely is not installed"
@@ -95,13 +96,15 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     """Check links for common mistakes, and return the findings with their remedies.
 
     Raises:
-        InputError: All links are far from the scene, the scene cannot be read, or shapely is not installed.
+        InputError: All receivers or all transmitters are far from the scene, the scene cannot be read, or shapely is
+            not installed.
     """
     overhead = SceneSurfaces.read(study.scene_source)
     scale = scale_findings(overhead.bounds[:3], overhead.bounds[3:])
     checks = (
         *((finding.problem, finding.remedy) for finding in scale if finding.severity == "error"),
         *_positions(overhead, links, study.links.position == "geographic", study.trace.refraction),
+        *_far_transmitters(study, links, overhead.bounds),
         *_units(study),
         *_levels(study, links, overhead),
         *_delays(study, links, overhead),
@@ -250,6 +253,41 @@ def _positions(
         yield problem, "check position and height: an antenna on a roof must be above the roof"
 
 
+def _far_transmitters(
+    study: StudyModel, links: Measurements, bounds: NDArray[np.float64]
+) -> Iterator[tuple[str, str]]:
+    """Name the transmitters that are far from the scene.
+
+    Raises:
+        InputError: All transmitters are far from the scene.
+    """
+    furthest, far = _far(bounds, links.tx)
+    if not far.any():
+        return
+    first = int(np.argmax(far))
+    name = study.links.transmitter
+    names = sorted(set(links.frame[name][far].astype(str))) if name in links.frame else ["the transmitter"]
+    problem = (
+        f"{shortened(', '.join(names))} {'is' if len(names) == 1 else 'are'} more than {furthest:.0f} m from the "
+        f"scene, near ({links.tx[first, 0]:.0f}, {links.tx[first, 1]:.0f}) m"
+    )
+    remedy = "check the position" + (
+        " and the order of longitude and latitude" if study.links.position == "geographic" else ""
+    )
+    if far.all():
+        raise InputError(f"{study.transmitters_path or links.source}: {problem}; {remedy}")
+    yield problem, remedy
+
+
+def _far(bounds: NDArray[np.float64], positions: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
+    """The distance from the scene beyond which positions are far [m], and the mask of far positions [n]."""
+    low, high = bounds[:2], bounds[3:5]
+    # The limit is at least one kilometre, because the scene may be a room.
+    furthest = FAR * max(float(np.max(high - low)), 100.0)
+    outside = (positions[:, :2] < low - furthest) | (positions[:, :2] > high + furthest)
+    return furthest, np.asarray(outside.any(axis=1))
+
+
 def refuse_far_receivers(
     bounds: NDArray[np.float64], rx: NDArray[np.float64], source: str, is_geographic: bool
 ) -> None:
@@ -264,10 +302,8 @@ def refuse_far_receivers(
     Raises:
         InputError: All receivers are farther away.
     """
-    low, high = bounds[:2], bounds[3:5]
-    # The limit is at least one kilometre, because the scene may be a room.
-    furthest = FAR * max(float(np.max(high - low)), 100.0)
-    if ((rx[:, :2] < low - furthest) | (rx[:, :2] > high + furthest)).any(axis=1).all():
+    furthest, far = _far(bounds, rx)
+    if far.all():
         centre = rx.mean(axis=0)
         raise InputError(
             f"{source}: all receivers are more than {furthest:.0f} m from the scene, near ({centre[0]:.0f}, "
