@@ -368,3 +368,14 @@ def test_transmitted_powers_in_other_units_are_not_taken_for_dbm(name):
     assert (
         column_names.find_transmit_power(pd.DataFrame({name: [20.0], "EIRP [dBm]": [43.0]})) == "EIRP [dBm]"
     )
+
+
+@pytest.mark.parametrize(
+    "name", ["Velocidad [km/h]", "Speed (km/h)", "speed_km_h", "GPS speed [m/s]", "Time [h]"]
+)
+def test_units_of_speeds_and_hours_are_not_heights(name):
+    """Nearly every export of a drive test has a speed."""
+    frame = pd.DataFrame({"Longitude": [9.9], "Latitude": [50.0], name: [31.0]})
+    assert column_names.find_position(frame, "rx", unnamed=True).height is None
+    named = column_names.find_position(frame.assign(h=1.5), "rx", unnamed=True)
+    assert named.height == "h"

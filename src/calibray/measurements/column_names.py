@@ -38,6 +38,7 @@ PATTERNS: Final = {
     "latitude": r"lat|latitude|latitud|latitudine|breite|breitengrad",
     "height": r"z|h|height|heights|ht|hgt|agl|hba|ant(enna)?height|(antennen)?h(o|oe)he|altura|hauteur|altezza",
     "another height": r"ground|terrain|amsl|asl|msl|nn|nhn|msnm|building|tower|clutter|mast",
+    "speed": r"speed|velocity|km_?h|kmph|kph|geschwindigkeit|velocidad|vitesse|velocita",
     "altitude or floor": r"alt|altitude|level|altitud|elevation|elev",
     "path loss": r"pl|loss|pathloss|(pfad|strecken|funkfeld)?d(a|ae)mpfung|pfadverlust|perdidas?|pertes?|perdita",
     "path gain": r"gain|pathgain",
@@ -140,12 +141,14 @@ def words(name: object) -> frozenset[str]:
         ['bs', 'bslatitude', 'deg', 'latitude']
         >>> sorted(words("Time of Flight [ns]")), sorted(words("round_trip_time_us"))
         (['ns', 'tof'], ['rtt', 'us'])
-        >>> sorted(words("delay (\u00b5s)"))
-        ['delay', 'us']
+        >>> sorted(words("delay (\u00b5s)")), sorted(words("Speed [km/h]"))
+        (['delay', 'us'], ['speed'])
     """
     # A time of flight must not be mistaken for a time of day.
     text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name).replace("\u03bc", "u"))
     text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
+    # The units of speeds and hours do not indicate a column of heights (h).
+    text = re.sub(r"(?i)(?<![a-z])k?m\s*/\s*[hs](?![a-z])|[\[(]\s*h\s*[\])]", " ", text)
     # Units with several capitals stay one word, such as "dBm".
     text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", text)
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
@@ -258,9 +261,11 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
 def _height(names: Iterable[str]) -> str | None:
     """The first column of antenna heights, or else of other heights.
 
-    Heights of the ground or of buildings are ignored.
+    Heights of the ground or of buildings are ignored, as are speeds such as "Speed km h".
     """
-    heights = [name for name in names if matches(name, "height") and not matches(name, "another height")]
+    heights = [
+        name for name in names if matches(name, "height") and not matches(name, "another height", "speed")
+    ]
     return min(heights, key=lambda name: not matches(name, "antenna"), default=None)
 
 
