@@ -50,7 +50,10 @@ def test_links_get_the_columns_of_their_transmitters():
     for rows, message in (
         (sites.iloc[1:], "log.csv: sites.csv lacks 'two', the transmitter of 1 of 3 rows; use one of: one"),
         (sites.iloc[:0], r"'one', 'two', .*where = \"`transmitter` not in \['one', 'two'\]\""),
-        (pd.concat([sites, sites]), "sites.csv: one of two, one, two, one appears twice"),
+        (
+            pd.concat([sites, sites.assign(z=1.0)]),
+            "sites.csv: 'two' appears in rows 1, 3 of column 'transmitter'",
+        ),
         (sites.drop(columns="transmitter"), "sites.csv: no column 'transmitter'"),
     ):
         with pytest.raises(InputError, match=message):

@@ -264,7 +264,7 @@ def test_a_column_of_altitudes_that_is_not_used_is_named(scene, tmp_path, column
     found = draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 2.4e9)
     (reason,) = [each.reason for each in found.assumptions if each.what == "links.rx"]
     assert found.study.links.rx == ("lon", "lat", height)
-    assert ("alt may be above sea level" in reason) == (column == "alt")
+    assert ("alt is ignored, because it may be above sea level" in reason) == (column == "alt")
 
 
 @pytest.mark.parametrize(("places", "height"), [(12, 1.5), (2, 10.0)])
@@ -452,8 +452,53 @@ def test_rows_without_a_receiver_position_are_left_out_and_counted(scene, tmp_pa
     drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
     assert reasons["links.where"] == "no receiver position: 3 rows are left out"
-    assert assumed(drafted)["links.where"] == "(`x`.notna()) and `y`.notna()"
+    assert assumed(drafted)["links.where"] == "`x`.notna() and `y`.notna()"
     assert drafted.study.measurements().rx[:, 0].tolist() == [*range(3, 10)]
+
+
+def test_unknown_transmitters_are_named_on_stderr_and_in_one_assumption(scene, tmp_path, caplog):
+    (tmp_path / "sites.csv").write_text("cell,x,y,z\nA,-30,0,15\nB,60,0,15\n")
+    east = np.arange(10.0)
+    east[0] = np.nan
+    file = table(tmp_path, x=east, y=20.0, cell=list("AABBAABCCD"), rssi=np.arange(-90.0, -80.0))
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
+    assert "sites.csv lacks C (2 rows), D (1 row); these rows are left out" in caplog.text
+    filters = [each for each in drafted.assumptions if each.what == "links.where"]
+    assert [each.value for each in filters] == ["`cell` in ['A', 'B'] and `x`.notna()"]
+    assert filters[0].reason == (
+        "sites.csv lacks C, D: 3 rows are left out; no receiver position: 1 row is left out"
+    )
+    assert len(drafted.study.measurements()) == 6
+
+
+def test_a_repeated_transmitter_is_named_unless_its_rows_are_equal(scene, tmp_path):
+    sites, study = tmp_path / "sites.csv", tmp_path / "study.toml"
+    file = table(tmp_path, x=np.arange(10.0), y=20.0, cell=list("AB" * 5), rssi=np.arange(-90.0, -80.0))
+    sites.write_text("cell,x,y,z\nA,-30,0,15\nB,60,0,15\nB,60,0,15\n")
+    drafted = draft(scene, file, study, sites, 3.5e9)
+    assert np.unique(drafted.study.measurements().tx[:, 0]).tolist() == [-30.0, 60.0]
+    sites.write_text("cell,x,y,z\nA,-30,0,15\nB,60,0,15\nB,70,0,15\n")
+    with pytest.raises(InputError, match=r"sites.csv: 'B' appears in rows 3, 4 of column 'cell'; give each"):
+        draft(scene, file, study, sites, 3.5e9)
+
+
+def test_faults_of_the_table_of_transmitters_are_named(scene, tmp_path):
+    sites, study = tmp_path / "sites.csv", tmp_path / "study.toml"
+    file = table(tmp_path, x=np.arange(10.0), y=20.0, cell=list("AB" * 5), rssi=np.arange(-90.0, -80.0))
+    sites.write_text("cell,x,y,z,Frequency (Hz)\nA,-30,0,15,1842.5\nB,60,0,15,1842.5\n")
+    with pytest.raises(
+        InputError, match=r"sites.csv: column 'Frequency \(Hz\)' has values of about 1842.5, must"
+    ):
+        draft(scene, file, study, sites)
+    sites.write_text('cell,x,y,z\nA,"-30,0",0,15\nB,"60,5",0,15\n')
+    with pytest.raises(
+        InputError, match=r"sites.csv: no columns of positions.*contains text such as '-30,0'"
+    ):
+        draft(scene, file, study, sites, 3.5e9)
+    sites.write_text("cell,x,y,Height AMSL (m)\nA,-30,0,55\nB,60,0,55\n")
+    drafted = draft(scene, file, study, sites, 3.5e9)
+    reasons = {each.what: each.reason for each in drafted.assumptions}
+    assert "Height AMSL (m) is ignored, because it may be above sea level" in reasons["links.tx"]
 
 
 def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(scene, tmp_path):

@@ -374,11 +374,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
         >>> find_frequency(pd.DataFrame({"BW [MHz]": [20.0], "Frq [MHz]": [763.0]}))
         ('Frq [MHz]', array([7.63e+08]))
     """
-    names = numeric_columns(frame)
-    in_hertz = [
-        name for name in names if words(name) & {*FREQUENCY_UNITS} and not matches(name, "bandwidth or shift")
-    ]
-    for name in dict.fromkeys([*(name for name in names if matches(name, "frequency")), *in_hertz]):
+    for name in _frequency_columns(frame):
         values = frame[name].to_numpy(dtype=float)
         if np.isnan(values).all():
             continue
@@ -389,6 +385,31 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
         if FREQUENCIES[0] <= np.nanmin(carriers) and np.nanmax(carriers) <= FREQUENCIES[1]:
             return name, carriers
     return None
+
+
+def no_frequency(frame: pd.DataFrame) -> str:
+    """Describe a column of carrier frequencies with values that are out of range; empty without such a column.
+
+    Example:
+        >>> no_frequency(pd.DataFrame({"Frequency (Hz)": [1842.5]}))
+        "column 'Frequency (Hz)' has values of about 1842.5, must be 1e+06 to 1e+12 Hz; correct the unit in its name"
+    """
+    for name in _frequency_columns(frame):
+        if frame[name].notna().any() and not matches(name, "bandwidth or shift"):
+            return (
+                f"column {shortened(name)!r} has values of about {frame[name].median():g}, must be "
+                f"{FREQUENCIES[0]:.0e} to {FREQUENCIES[1]:.0e} Hz; correct the unit in its name"
+            )
+    return ""
+
+
+def _frequency_columns(frame: pd.DataFrame) -> list[str]:
+    """Columns of numbers with a word for frequency in their names, followed by those with a unit of frequency."""
+    names = numeric_columns(frame)
+    in_hertz = [
+        name for name in names if words(name) & {*FREQUENCY_UNITS} and not matches(name, "bandwidth or shift")
+    ]
+    return list(dict.fromkeys([*(name for name in names if matches(name, "frequency")), *in_hertz]))
 
 
 def find_time(frame: pd.DataFrame) -> str | None:

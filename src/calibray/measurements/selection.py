@@ -15,6 +15,7 @@ from calibray.measurements.placement import join_track
 from calibray.measurements.preparation import Preparation
 from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import MAX_LISTED, did_you_mean, shortened
+from calibray.tables import rows_text
 
 
 def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
@@ -162,15 +163,32 @@ def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str |
     return columns[0] if len(columns) == 1 else None
 
 
+def distinct_rows(transmitters: SourceTable) -> SourceTable:
+    """The rows of a table of transmitters without repetitions of equal rows."""
+    return transmitters.select(~transmitters.frame.duplicated().to_numpy())
+
+
+def repeated_label(transmitters: SourceTable, column: str) -> str:
+    """A message that names the first repeated label in a column of names and its rows; empty if all are distinct."""
+    names = transmitters.frame[column]
+    if not (repeated := names.duplicated() & names.notna()).any():
+        return ""
+    label = names[repeated].iloc[0]
+    rows = rows_text(transmitters.row[(names == label).to_numpy(bool)].tolist())
+    return (
+        f"{transmitters.source}: {shortened(str(label))!r} appears in {rows} of column {column!r}; give each "
+        "transmitter its own name, or remove all but one of these rows"
+    )
+
+
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
     """Add the columns of the table of transmitters to the links; the columns of names can have different names."""
+    transmitters = distinct_rows(transmitters)
     label_of_link = table.labels(key).tolist()
     name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
     labels = transmitters.labels(name).tolist()
-    if len(set(labels)) != len(labels):
-        raise InputError(
-            f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one of the rows"
-        )
+    if repeated := repeated_label(transmitters, name):
+        raise InputError(repeated)
     compared = comparison(labels)
     index_of_label = {label: index for index, label in enumerate(compared(labels))}
     compared_of_link = compared(label_of_link)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.column_names import WATTS, is_named_value, matches, numeric_columns, words
-from calibray.measurements.selection import comparison, naming_column
+from calibray.measurements.selection import comparison, naming_column, repeated_label
+from calibray.measurements.source_table import SourceTable
 
 MAX_DEVICES: Final = 12
 """Largest number of receiving devices. A column with more values probably contains a different quantity, such as a
@@ -152,24 +153,24 @@ def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) 
     return None
 
 
-def find_transmitter_names(transmitters: pd.DataFrame) -> list[str]:
+def find_transmitter_names(transmitters: SourceTable) -> list[str]:
     """Find the columns of names, such as sites and cells, in a table with one row per transmitter.
 
     Raises:
         InputError: No column of names distinguishes the transmitters.
     """
-    names = [
-        str(name)
-        for name in transmitters
-        if matches(name, "name of a transmitter", "transmitter")
-        and transmitters[name].nunique() == len(transmitters)
-    ]
-    if not names:
-        raise InputError(
-            f"transmitters: no column contains distinct names ({', '.join(map(str, transmitters))}); name such a "
-            "column 'transmitter'"
-        )
-    return names
+    frame = transmitters.frame
+    names = [str(name) for name in frame if matches(name, "name of a transmitter", "transmitter")]
+    distinct = [name for name in names if frame[name].nunique() == len(frame)]
+    if distinct:
+        return distinct
+    fullest = max(names, key=lambda name: frame[name].nunique(), default=None)
+    repeated = "" if fullest is None else repeated_label(transmitters, fullest)
+    raise InputError(
+        repeated
+        or f"{transmitters.source}: no column contains distinct names ({', '.join(map(str, frame))}); name such a "
+        "column 'transmitter'"
+    )
 
 
 def find_devices(frame: pd.DataFrame) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -29,18 +30,20 @@ from calibray.measurements import (
 )
 from calibray.measurements.column_names import PositionColumns
 from calibray.measurements.links import FEW, MAX_CARRIERS
-from calibray.measurements.selection import comparison, find_codes
+from calibray.measurements.selection import comparison, distinct_rows, find_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study.content import BUNDLED, VERSION
 from calibray.study.link_checks import FAR
 from calibray.study.study import Study
-from calibray.support.messages import counted
+from calibray.support.messages import counted, shortened
+
+_LOG: Final = logging.getLogger(__name__)
 
 RECEIVER_HEIGHT: Final = 1.5
 """Default height of a receiver without a column of heights [m], for a handheld phone."""
 
-ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn"})
+ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn", "msnm"})
 """Words in the names of altitude columns. Satellite receivers report altitudes above sea level; drones also report
 altitudes above ground."""
 
@@ -121,7 +124,8 @@ class LinksDraft:
     def __post_init__(self) -> None:
         self._transmitter_key = ""
         self.table = read_table(self.links)
-        self.sites = None if self.given.transmitters is None else read_table(self.given.transmitters)
+        transmitters = self.given.transmitters
+        self.sites = None if transmitters is None else distinct_rows(read_table(transmitters))
         self.section["file"] = self.relative(self.links)
         self._add_track()
         self._add_transmitters()
@@ -158,8 +162,13 @@ class LinksDraft:
         return self.transmitter_table.frame
 
     def assume(self, what: str, value: object, reason: str) -> None:
-        """Record an assumption."""
-        self.assumptions.append(Assumption(what, str(value), reason))
+        """Record an assumption. A second assumption of the same key replaces the value and adds a reason."""
+        earlier = next((entry for entry in self.assumptions if entry.what == what), None)
+        if earlier is None:
+            self.assumptions.append(Assumption(what, str(value), reason))
+        else:
+            merged = Assumption(what, str(value), f"{earlier.reason}; {reason}")
+            self.assumptions[self.assumptions.index(earlier)] = merged
 
     def measurements(self) -> Measurements:
         """The links, read with the keys drafted so far."""
@@ -217,7 +226,7 @@ class LinksDraft:
             return
         wide = {
             name: transmitter_columns.find_wide_columns(self.table.frame, self.sites.labels(name).tolist())
-            for name in transmitter_columns.find_transmitter_names(self.sites.frame)
+            for name in transmitter_columns.find_transmitter_names(self.sites)
         }
         name, columns = max(wide.items(), key=lambda item: len(item[1]))
         if not columns:
@@ -260,6 +269,12 @@ class LinksDraft:
             "the table of transmitters" if self.given.transmitters is None else self.given.transmitters.name
         )
         self._leave_out(lacking, f"{source} lacks {named}" if names else "no transmitter is stated")
+        if names:
+            counts = [f"{name} ({counted(int((column == name).sum()), 'row')})" for name in names]
+            _LOG.warning(
+                "%s: %s lacks %s; these rows are left out; add these transmitters to keep them",
+                self.links, source, shortened(", ".join(counts), 300),
+            )  # fmt: skip
 
     def _leave_out_unplaced_receivers(self) -> None:
         """Draft a filter that excludes rows without a receiver position, such as rows without a satellite fix."""
@@ -280,10 +295,9 @@ class LinksDraft:
         self.table = self.table.select(~rows)
 
     def add_filter(self, condition: str) -> None:
-        """Add a condition to the row filter."""
+        """Add a condition to the row filter; a condition with `or` must be in parentheses."""
         where = self.section.get("where")
-        # Parentheses, because the first condition may contain `or`.
-        self.section["where"] = condition if where is None else f"({where}) and {condition}"
+        self.section["where"] = condition if where is None else f"{where} and {condition}"
 
     def assume_codes(self, codes: Sequence[float], columns: str) -> None:
         """Record numbers that represent missing measurements."""
@@ -305,21 +319,27 @@ class LinksDraft:
             self.assume("scene.frequency", f"{given:g} Hz", reason)
             return float(given)
         if stated is None:
+            for file, rows in self._frequency_tables():
+                if fault := column_names.no_frequency(rows):
+                    raise InputError(f"{file}: {fault}, or give --frequency")
             raise InputError(
                 f"{self.links}: no column of carrier frequencies; give --frequency, for instance --frequency 3.5e9"
             )
         self.assume("scene.frequency", f"{stated[0]:g} Hz", stated[1])
         return stated[0]
 
+    def _frequency_tables(self) -> list[tuple[Path, pd.DataFrame]]:
+        """The tables that can state carriers, by file, in the order of their priority."""
+        sites = self.given.transmitters
+        return [(self.links, self.table.frame), *([(sites, self.transmitter_rows)] if sites else [])]
+
     def _stated_frequency(self) -> tuple[float, str] | None:
         """A carrier stated in a table [Hz] and its description; a column of carriers becomes ``links.frequency``."""
-        rows, file = self.table.frame, self.links
-        if column_names.find_frequency(rows) is None and self.given.transmitters is not None:
-            rows, file = self.transmitter_rows, self.given.transmitters
-        column = column_names.find_frequency(rows)
-        if column is None:
+        tables = ((*table, column_names.find_frequency(table[1])) for table in self._frequency_tables())
+        stated = next(((file, rows, column) for file, rows, column in tables if column is not None), None)
+        if stated is None:
             return None
-        name, values = column
+        file, rows, (name, values) = stated
         carriers = np.unique(values[np.isfinite(values)])
         if carriers[-1] - carriers[0] < SAME_CARRIER * carriers[0]:
             return float(np.nanmedian(values)), f"median of column {name}"
@@ -348,8 +368,7 @@ class LinksDraft:
             raise InputError(
                 f"{self.links}: no columns of receiver positions ({self._columns()}); name these columns rx_x, rx_y, "
                 "rx_z [m], or longitude and latitude"
-                f"{column_names.text_instead(self.table.frame, 'x', 'y', 'longitude', 'latitude')}"
-                f"{column_names.no_degrees(self.table.frame)}"
+                f"{self._position_hints(self.table.frame)}"
             )
         if self.given.tx is not None:
             return rx, None
@@ -358,9 +377,17 @@ class LinksDraft:
         tx = column_names.find_position(self.sites.frame, "tx", unnamed=True)
         if tx is None:
             columns = ", ".join(map(str, self.sites.frame))
-            raise InputError(f"{self.given.transmitters}: no columns of positions ({columns})")
+            raise InputError(
+                f"{self.given.transmitters}: no columns of positions ({columns}); name these columns x, y, z [m], or "
+                f"longitude and latitude{self._position_hints(self.sites.frame)}"
+            )
         x, y, height = (self._name_in_links(name) for name in (tx.x, tx.y, tx.height))
         return rx, PositionColumns(tx.position, str(x), str(y), height)
+
+    @staticmethod
+    def _position_hints(frame: pd.DataFrame) -> str:
+        text = column_names.text_instead(frame, "x", "y", "longitude", "latitude")
+        return text + column_names.no_degrees(frame)
 
     def _projected(
         self, rx: PositionColumns, tx: PositionColumns | None
@@ -404,12 +431,7 @@ class LinksDraft:
         if unit == "degrees" and not column_names.matches(rx.x, "longitude"):
             reason = "the positions are on the scene if read as degrees"
         if rx.height is None:
-            reason += f"; no height: {RECEIVER_HEIGHT} m"
-            unused = [str(name) for name in self.table.frame if column_names.words(name) & ALTITUDES]
-            if unused:
-                reason += (
-                    f" ({unused[0]} may be above sea level; rename it 'height' if it is above the ground)"
-                )
+            reason += f"; no height: {RECEIVER_HEIGHT} m{self._unused_altitudes(self.table.frame)}"
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
         if rx.position != "geographic":
             return
@@ -422,6 +444,13 @@ class LinksDraft:
         known = f"{Path(self.scene).name} has" if self.given.origin is None else "--origin states"
         reason = f"{unit}; {known} the georeference of the scene"
         self.assume("links.position", "geographic", reason)
+
+    @staticmethod
+    def _unused_altitudes(frame: pd.DataFrame) -> str:
+        """Name a column of altitudes, which may be above sea level and is therefore not used; empty without one."""
+        unused = [str(name) for name in frame if column_names.words(name) & ALTITUDES]
+        hint = "is ignored, because it may be above sea level; rename it 'height' if it is above the ground"
+        return f" ({unused[0]} {hint})" if unused else ""
 
     def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
         """Add the unit of the position columns if their names state a unit other than the metre."""
@@ -469,9 +498,9 @@ class LinksDraft:
                 if self.given.transmitters is None
                 else f"columns of {self.given.transmitters.name}"
             )
-            reason += (
-                "" if tx.height else f"; no height: {height:g} m{', because they move' if moves else ''}"
-            )
+            if tx.height is None:
+                reason += f"; no height: {height:g} m{', because they move' if moves else ''}"
+                reason += "" if self.sites is None else self._unused_altitudes(self.sites.frame)
             self.assume("links.tx", ", ".join(map(str, position)), reason)
             if self.given.transmitters is None:
                 self._name_transmitters(tx)

@@ -308,7 +308,7 @@ def _content(file: Path, changed: int) -> str:
         find_value(table)
         return "links"
     with suppress(InputError):
-        find_transmitter_names(table.frame)
+        find_transmitter_names(table)
         return "transmitters" if find_position(table.frame, "tx", unnamed=True) else ""
     return ""
 
