@@ -70,7 +70,10 @@ def test_buildings_of_an_extract_have_holes_and_heights(extract):
     assert buildings.height_from == ("height", "levels", "default", "height", "height")
     assert buildings.guessed() == {"levels": ["way-2"], "default": ["way-3"]}
     assert buildings.part.tolist() == [False, False, False, True, False]
-    assert buildings.repairs == {"incomplete in the extract, left out": 1}
+    assert buildings.repairs == {
+        "incomplete in the extract, left out": 1,
+        "buildings with an unusable height or number of storeys, such as 'tall'": 1,
+    }
     # Corners come back to the grid of 1 cm.
     assert shapely.area(buildings.polygon) == pytest.approx([400, 400, 400, 400, 300], rel=2e-3)
     assert buildings.bounds == pytest.approx([0, 0, 220, 20], abs=0.011)
@@ -587,7 +590,7 @@ def test_trees_of_an_extract_have_crowns_and_heights(tmp_path):
         "tree rows": 1,
         "woods": 1,
         "forests": 1,
-        "of them with an assumed height": 2,
+        "trees, tree rows and woods with an assumed height": 2,
     }
     by = {
         (kind, top): (shape, low)

@@ -20,7 +20,7 @@ from calibray.tracing.protocol import EnclosedAntennas
 
 _HEIGHT_SOURCES: Final = {
     "levels": "height from the number of storeys",
-    "default": "no height given, default used",
+    "default": "no usable height given, default used",
 }
 
 

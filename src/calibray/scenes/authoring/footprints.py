@@ -119,7 +119,7 @@ class Footprints:
         height_from: Source of each top [n].
         part: Whether each outline is a part of a building [n]; parts take precedence over the outline of the whole
             building.
-        repairs: Number of outlines that were changed or left out, by reason.
+        repairs: Number of buildings that were changed or left out, or have an unusable height, by reason.
     """
 
     polygon: NDArray[Any]
@@ -226,6 +226,7 @@ def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
 _LOG: Final = logging.getLogger(__name__)
 
 _KEYS: Final = ("building", "building:part")
+_HEIGHT_KEYS: Final[dict[str, HeightSource]] = {"height": "height", "building:levels": "levels"}
 _SOURCES: Final[tuple[HeightSource, ...]] = ("default", "levels", "height")
 
 
@@ -270,6 +271,18 @@ def read_openstreetmap(
     frame = frame or _local_frame(degrees, WGS84)
     bottoms, tops, sources = zip(*(rule.heights(building) for building in tags), strict=True)
     incomplete = announced - len(outlines)
+    # A stated height or number of storeys that a less reliable source replaces, such as "~25".
+    unused = [
+        building[key]
+        for building, source in zip(tags, sources, strict=True)
+        for key in [next((key for key in _HEIGHT_KEYS if key in building), None)]
+        if key is not None and _HEIGHT_KEYS[key] != source
+    ]
+    repairs = {"incomplete in the extract, left out": max(incomplete, 0)}
+    if unused:
+        repairs[
+            f"buildings with an unusable height or number of storeys, such as {shortened(unused[0])!r}"
+        ] = len(unused)
     raw = Footprints(
         polygon=project(degrees, frame, WGS84),
         bottom=np.array(bottoms),
@@ -277,7 +290,7 @@ def read_openstreetmap(
         name=tuple(names),
         height_from=sources,
         part=np.array([building.get("building:part", "no") != "no" for building in tags]),
-        repairs={"incomplete in the extract, left out": incomplete} if incomplete > 0 else {},
+        repairs=repairs,
     )
     return clean_footprints(raw), frame
 

@@ -73,7 +73,11 @@ class Trees:
     @property
     def counts(self) -> dict[str, int]:
         """Number of polygons by kind, and number of polygons with an assumed height."""
-        assumed = {"of them with an assumed height": int(self.assumed.sum())} if self.assumed.any() else {}
+        assumed = (
+            {"trees, tree rows and woods with an assumed height": int(self.assumed.sum())}
+            if self.assumed.any()
+            else {}
+        )
         return dict(Counter(f"{name}s" for name in self.kind.tolist())) | assumed
 
     def within(self, bounds: NDArray[np.float64]) -> Trees:
