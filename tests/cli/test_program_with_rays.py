@@ -139,7 +139,7 @@ def test_a_second_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
 
 
 def test_predictions_and_the_page_show_the_rays_of_the_program(
-    finished: tuple[Path, str], tmp_path: Path
+    finished: tuple[Path, str], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Two calls give the rays of new links for both models of an average; their path loss is that of the program."""
     folder, _ = finished
@@ -153,6 +153,13 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
     used = [list(values.values()) for values in (model.parameters, model.averaged) if values is not None]
     answered = cb.engines.make(setup).path_loss(np.array(used))
     np.testing.assert_allclose(predicted, answered.mean(axis=0), atol=1e-6)
+    assert "changed since the calibration" not in caplog.text
+    program = folder / "program.py"
+    correct = program.read_text()
+    program.write_text(correct.replace("+ gain + 3.5", "+ gain + 3.4"))
+    np.testing.assert_allclose(result.predict(new), predicted + 0.1, atol=1e-6)
+    assert "the program or its files changed since the calibration" in caplog.text
+    program.write_text(correct)
     before = calls(folder)
     assert run("report", folder / "out", "-o", tmp_path / "report.html").exit_code == 0
     assert "The model represents the program" in (tmp_path / "report.html").read_text()

@@ -300,3 +300,20 @@ def test_a_file_that_is_no_ledger_is_refused(tmp_path):
         later.execute("PRAGMA user_version = 7")
     with pytest.raises(InputError, match="a ledger of version 7"):
         Ledger(tmp_path / "later")
+
+
+def test_calls_of_a_changed_program_are_used_again_with_a_warning(tmp_path, caplog):
+    study, file, program = programs.study(tmp_path), tmp_path / "ledger.sqlite", tmp_path / "model.py"
+    text = program.read_text()
+    program.write_text("a fault, without stored calls")
+    with pytest.raises(EngineError):
+        engines.make(study, ledger=file).path_loss(CANDIDATES)
+    program.write_text(text)
+    loss = engines.make(study, ledger=file).path_loss(CANDIDATES)
+    engines.make(study, ledger=file).path_loss(CANDIDATES)
+    assert "changed since" not in caplog.text
+    program.write_text(text.replace("return 60 +", "return 65 +"))
+    assert engines.make(study, ledger=file).path_loss(CANDIDATES).tolist() == loss.tolist()
+    (message,) = [text for text in caplog.messages if "changed since" in text]
+    assert f"{file}: model.py changed since the stored RT calls" in message
+    assert "use another folder, or delete the ledger" in message

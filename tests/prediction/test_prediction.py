@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 from typer.testing import CliRunner
 
 import planted
+import programs
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
@@ -27,6 +28,7 @@ from calibray.prediction.suggestion import suggest
 from calibray.result.held_out import BlockErrors, ResidualField
 from calibray.scenes import Triangles
 from calibray.scenes.checks.positions import locate
+from calibray.study import Study
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels
 from calibray.validation.models import TX_OFFSET
@@ -426,3 +428,20 @@ def test_labels_that_read_as_numbers_alone_are_those_of_the_measured_links(tmp_p
     together = result.predict(table.drop(columns="path_loss_db"))[(table.cell == "1e5").to_numpy()]
     assert result.predict(one.assign(cell=100_000.0)) == pytest.approx(together)
     assert (suggest(result, one.assign(cell=100_000.0), 1).group == "1e5").all()
+
+
+def test_a_program_that_changed_since_the_calibration_is_reported(tmp_path, caplog):
+    """One calibration link is sent with the new links; it does not change their predictions."""
+    method = {"name": "random", "model": "none", "options": {"budget": 6}}
+    content = programs.content(tmp_path) | {"method": method}
+    result = calibrate(Study.from_content(content, tmp_path / "study.toml"))
+    new = planted.links().head(3)
+    predicted = result.predict(new)
+    values = np.array(list(result.parameters.values()))
+    assert predicted == pytest.approx(programs.expected(values, new)[0])
+    assert "changed since the calibration" not in caplog.text
+    program = tmp_path / "model.py"
+    program.write_text(program.read_text().replace("return 60 +", "return 60.5 +"))
+    assert result.predict(new) == pytest.approx(predicted + 0.5)
+    (message,) = [text for text in caplog.messages if "the program or its files changed" in text]
+    assert "run the study again into a new folder" in message

@@ -66,7 +66,8 @@ def make(
     if ledger is None or not opened.engine.expensive:
         return engine
     # Every expensive kind returns its answers one by one.
-    return Recorded(cast(Answering, engine), Ledger(ledger), fingerprint(opened), name, progress)
+    files = opened.engine.program_files(opened)
+    return Recorded(cast(Answering, engine), Ledger(ledger), fingerprint(opened), name, progress, files)
 
 
 def fingerprint(study: OpenedStudy) -> str:

@@ -168,6 +168,10 @@ class EngineSection(Section, ABC):
     def answers_by(self, study: OpenedStudy) -> list[str] | None:
         """Versions or a command line that determine the answers; None if answers are not stored in a ledger."""
 
+    def program_files(self, study: OpenedStudy) -> dict[str, str]:
+        """SHA-256 of the program's files in the study's folder, by their names on the command line."""
+        return {}
+
     @abstractmethod
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None

@@ -20,6 +20,7 @@ from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
+from calibray.paths import take_links
 from calibray.prediction.corrections import (
     calibration_residuals,
     fill_missing,
@@ -55,6 +56,10 @@ NEAR_SHARE: Final = 0.1
 WEAKER_DB: Final = 10.0
 """Excess over the largest measured path loss above which a prediction has a remark [dB]. In a synthetic town with wrong
 building heights, the errors of such predictions were up to 46 dB."""
+
+
+SAME_ANSWER_DB: Final = 0.01
+"""Largest difference between a program's answer for a calibration link and the stored one that is not a change [dB]."""
 
 
 def predict(
@@ -374,19 +379,65 @@ def _replay(
         scene_values = setup.parameters.start[None, values.shape[1] :]
         drawn = np.stack([draws[name] for name in names], axis=1)
         values = np.vstack([np.hstack([values, scene_values]), drawn])
-    answers = None
-    if result.study.engine.external and not result.study.engine.exports_rays:
-        program = setup.study.engine.open(setup, None, None, None)
+    answers, count, rays = None, len(setup.links), result.study.engine.exports_rays
+    asked, stored_db = _with_calibration_link(result, setup)
+    if result.study.engine.external and not rays:
+        program = setup.study.engine.open(asked, None, None, None)
         answers = _answers(program, values[:averaged, : len(prediction.model.parameters)])
+        _warn_of_changed_program(result, answers[0, count:], stored_db)
+        answers = answers[:, :count]
         if not draws and not result.study.observables:
             return Replayed(program, values, averaged, answers)
-    engine = replay(setup, setup.trace(traced_materials(result, prediction.materials), progress))
-    if result.study.engine.exports_rays and averaged > 1:
+    paths = (asked if rays else setup).trace(traced_materials(result, prediction.materials), progress)
+    if rays:
+        _warn_of_changed_program(result, replay(asked, paths).path_loss(values[:1])[0, count:], stored_db)
+        paths = take_links(paths, np.arange(count))
+    engine = replay(setup, paths)
+    if rays and averaged > 1:
         second = replay(
             setup, setup.trace(setup.parameters.materials(values[1], setup.scene.materials), progress)
         )
         answers = np.vstack([engine.path_loss(values[:1]), second.path_loss(values[1:])])
     return Replayed(engine, values, averaged, answers)
+
+
+def _with_calibration_link(result: Record, setup: Setup) -> tuple[Setup, NDArray[np.float64]]:
+    """The opened study with one calibration link after the new links, and this link's stored path loss [1], [dB].
+
+    It is the weakest link with a path, because weak links depend on most parts of a program. If the engine is not a
+    program, or no such link has a carrier of the new links, the setup is unchanged, and nothing is stored [0].
+    """
+    links, ends, table = setup.links, result.ends, result.links
+    stored_db = table["scene_db"].to_numpy(float)
+    carrier = np.full(len(table), result.study.scene.frequency)
+    if "frequency" in table:
+        carrier = table["frequency"].to_numpy(float)
+    known = [result.study.scene.frequency] if links.frequency is None else links.frequency
+    stored_db = np.where(np.isin(carrier, known) & np.isfinite(stored_db), stored_db, -np.inf)
+    index = int(np.argmax(stored_db))
+    if not result.study.engine.external or ends is None or np.isneginf(stored_db[index]):
+        return setup, np.empty(0)
+    extended = Measurements(
+        np.vstack([links.tx, ends[index, :3]]),
+        np.vstack([links.rx, ends[index, 3:]]),
+        np.full(len(links) + 1, np.nan),
+        frequency=None if links.frequency is None else np.append(links.frequency, carrier[index]),
+    )
+    return replace(setup, links=extended), stored_db[[index]]
+
+
+def _warn_of_changed_program(
+    result: Record, answer_db: NDArray[np.float64], stored_db: NDArray[np.float64]
+) -> None:
+    """Warn if a program's answer for a calibration link [0 or 1] differs from the stored path loss."""
+    for answer, stored in zip(answer_db.tolist(), stored_db.tolist(), strict=True):
+        if not abs(answer - stored) <= SAME_ANSWER_DB:
+            _LOG.warning(
+                "%s: at the calibrated values, the program returns %.2f dB for a calibration link, but the result has "
+                "%.2f dB (allowed difference: %g dB): the program or its files changed since the calibration, or its "
+                "answers are random. Offsets and intervals do not apply to the changed program; run the study again "
+                "into a new folder", result.study.path, answer, stored, SAME_ANSWER_DB,
+            )  # fmt: skip
 
 
 def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64]:

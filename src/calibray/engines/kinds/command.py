@@ -22,6 +22,7 @@ from calibray.engines.section import EngineSection, OpenedStudy
 from calibray.errors import EngineError, InputError
 from calibray.measurements.observables import Statistic
 from calibray.support.messages import printable
+from calibray.support.output_files import exists, file_digest
 from calibray.support.progress import Progress
 from calibray.support.strict_models import Text
 
@@ -67,6 +68,12 @@ class CommandSection(EngineSection):
     def answers_by(self, study: OpenedStudy) -> list[str]:
         """The program, its arguments, and "rays" if it returns rays; the program's version is unknown."""
         return [*self.command, *(["rays"] if self.rays else [])]
+
+    def program_files(self, study: OpenedStudy) -> dict[str, str]:
+        """SHA-256 of the files in the study's folder that the command line names, by their names there."""
+        folder = study.source.resolve().parent
+        files = {word: folder / word for word in self.command if exists(folder / word)}
+        return {word: file_digest(file) for word, file in files.items() if file.is_relative_to(folder)}
 
     def open(
         self, study: OpenedStudy, paths: Paths | None, progress: Progress | None, workers: Workers | None

@@ -205,10 +205,13 @@ _ANSWERS: Final = """CREATE TABLE IF NOT EXISTS answers (
     digest BLOB, UNIQUE (problem, candidate))"""
 _RAYS: Final = """CREATE TABLE IF NOT EXISTS rays (
     problem TEXT NOT NULL, candidate BLOB NOT NULL, rays BLOB NOT NULL, PRIMARY KEY (problem, candidate))"""
+_PROGRAMS: Final = """CREATE TABLE IF NOT EXISTS programs (
+    problem TEXT NOT NULL, file TEXT NOT NULL, digest TEXT NOT NULL, PRIMARY KEY (problem, file)) WITHOUT ROWID"""
 _COLUMNS: Final = {
     "problems": ["problem", "engine", "parameters"],
     "answers": ["id", "problem", "candidate", "path_loss_db", "seconds", "failure", "time", "digest"],
     "rays": ["problem", "candidate", "rays"],
+    "programs": ["problem", "file", "digest"],
     "claims": ["problem", "candidate", "run", "owner", "expires"],
 }
 
@@ -276,7 +279,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
     run("PRAGMA journal_mode = WAL")
     run("PRAGMA synchronous = FULL")  # committed answers survive a power failure
     with transaction(connection):
-        for table in (_PROBLEMS, _ANSWERS, _RAYS, _CLAIMS):
+        for table in (_PROBLEMS, _ANSWERS, _RAYS, _PROGRAMS, _CLAIMS):
             run(table)
         for table, columns in _COLUMNS.items():
             names = [row[1] for row in run(f"PRAGMA table_info({table})")]

@@ -14,7 +14,7 @@ import shutil
 import sqlite3
 import tempfile
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, final
@@ -115,6 +115,24 @@ class Ledger:
         """
         with self._errors():
             database.insert_problem(self._connection, problem, engine, parameters)
+
+    def changed_program_files(self, problem: str, files: Mapping[str, str]) -> list[str]:
+        """Names of the files of a program that have changed since its stored calls.
+
+        `files` contains the current files with their digests. If the problem has no stored calls, these digests are
+        stored.
+
+        Raises:
+            EngineError: The ledger cannot be read or written.
+        """
+        with self._errors():
+            run = self._connection.execute
+            (stored,) = run("SELECT EXISTS (SELECT 1 FROM answers WHERE problem = ?)", (problem,)).fetchone()
+            if not stored and not self.read_only:
+                for file, digest in files.items():
+                    run("INSERT OR REPLACE INTO programs VALUES (?, ?, ?)", (problem, file, digest))
+            earlier = dict(run("SELECT file, digest FROM programs WHERE problem = ?", (problem,)))
+        return [name for name, digest in files.items() if earlier.get(name, digest) != digest]
 
     def find(self, problem: str, candidate: bytes, num_links: int) -> database.LedgerEntry | None:
         """The entry of a candidate, or None; a damaged entry is deleted with a warning.

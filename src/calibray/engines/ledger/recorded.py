@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from threading import Event
@@ -39,6 +39,7 @@ class Recorded:
         problem: Fingerprint of everything that determines the engine's answers apart from the candidate.
         name: Name of the engine.
         progress: Called with "waiting", the number of answers received from other runs, and the number awaited.
+        program_files: SHA-256 of the files of the engine's program by name, if it has any.
 
     Attributes:
         hits: Number of candidates so far that required no RT call, because they were in the ledger or repeated in a
@@ -46,11 +47,18 @@ class Recorded:
     """
 
     def __init__(
-        self, engine: Answering, ledger: Ledger, problem: str, name: str, progress: Progress | None = None
+        self,
+        engine: Answering,
+        ledger: Ledger,
+        problem: str,
+        name: str,
+        progress: Progress | None = None,
+        program_files: Mapping[str, str] | None = None,
     ) -> None:
         self.hits = 0
         self._engine, self._ledger, self._problem, self._name = engine, ledger, problem, name
         self._progress, self._described, self._warned = progress, False, False
+        self._unchecked_files = dict(program_files or {})
 
     @property
     def calls(self) -> int:
@@ -112,6 +120,7 @@ class Recorded:
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Yield answers from the ledger, or otherwise from the engine, until `stop` is set; see `Answering.answers`."""
         values, stop = candidates, stop or Event()
+        self._warn_of_changed_files()
         # A candidate that occurs several times in one batch is run only once.
         missing: dict[bytes, list[int]] = {}
         for index, value in enumerate(values):
@@ -135,6 +144,15 @@ class Recorded:
                     self._progress("waiting", max(0, awaited - len(missing)), max(awaited, len(missing)))
                 time.sleep(pause)
                 pause = min(2 * pause, LONGEST_WAIT)
+
+    def _warn_of_changed_files(self) -> None:
+        """Before the first answer, warn if the calls in the ledger come from other files of the program."""
+        files, self._unchecked_files = self._unchecked_files, {}
+        if files and (changed := self._ledger.changed_program_files(self._problem, files)):
+            _LOG.warning(
+                "%s: %s changed since the stored RT calls of this study, which are used again; if the change affects "
+                "the answers, use another folder, or delete the ledger", self._ledger.path, ", ".join(changed),
+            )  # fmt: skip
 
     def _from_ledger(self, missing: dict[bytes, list[int]]) -> Iterator[Answer]:
         """Yield the answers in the ledger, and remove their candidates from `missing`."""
