@@ -12,6 +12,7 @@ import pytest
 import calibray as cb
 import two_ray
 from calibray.calibration.result import Result
+from calibray.engines.rays.export import Exporting
 from calibray.errors import EngineError, InputError
 from calibray.fitting import ray_fit
 from calibray.result.held_out import Model
@@ -214,7 +215,17 @@ def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Pa
     for wrong, right, message in (
         ("+ [0.5]", "+ [0.0]", "from the nearest surface"),
         ('"watts"]', '"power_db"]', "states no power"),
-        ("[1, 2]", "{name: [row[k] for row in rows] for k, name in enumerate(names)}", "'path'"),
+        (
+            "[1, 2]",
+            "{name: [row[k] for row in rows] for k, name in enumerate(names)}",
+            "has no column 'path'",
+        ),
+        ('"step"', '"point"', "has no column 'point', which every ray table must have"),
+        (
+            '{"path_loss_db": [70]}',
+            "{name: [row[k] for row in rows] for k, name in enumerate(names)}",
+            "path loss instead of a ray table; remove rays = true",
+        ),
     ):
         program.write_text(correct.replace(right, wrong))
         with pytest.raises(EngineError, match=message):
@@ -225,6 +236,23 @@ def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Pa
     content = cb.Study.load(study).content()
     with pytest.raises(InputError, match=r"engine\.rays = true.*combining = 'coherent'"):
         cb.Study.from_content(content | {"objective": {"combining": "coherent"}}, study)
+
+
+def test_an_incomplete_table_is_a_failure_that_is_repeated(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study")
+    program = study.parent / "program.py"
+    odd = "rows = rows[:-1] if len(open('calls.log').read()) % 2 else rows\nprint('every second start')"
+    program.write_text(program.read_text().replace("names =", f"{odd}\nnames ="))
+    content = cb.Study.load(study).content()
+    candidate = np.array([TRUTH])
+    patient = cb.Study.from_content(content | {"engine": {**content["engine"], "retries": 1}}, study)
+    assert np.isfinite(cb.engines.make(patient).path_loss(candidate[None])).all()
+    assert calls(study.parent) == 2
+    # Without a further attempt, the call fails, and the next run repeats it.
+    setup, ledger = cb.Setup.open(cb.Study.load(study)), tmp_path / "ledger.sqlite"
+    with pytest.raises(EngineError, match=r"(?s)its path.*its output:\nevery second start.*and start again"):
+        Exporting(cb.engines.make(setup, ledger=ledger), setup).export(candidate)
+    assert Exporting(cb.engines.make(setup, ledger=ledger), setup).export(candidate).paths.num_paths == 32
 
 
 def test_rays_without_power_are_links_without_a_path(tmp_path: Path) -> None:

@@ -206,7 +206,7 @@ WRONG = {
     "a column twice": (lambda t: t.assign(**{" Path": t.path}), "2 columns 'path'; keep one"),
     "a path without power": (
         lambda t: t.assign(power_db=t.power_db.where(t.path != 3)),
-        "path 3 states no power_db; add it, or -inf for a path without power",
+        r"path 3 states no power_db; add it, or -inf \(-10000 in JSON\) for a path without power",
     ),
     "a path without delay": (
         lambda t: t.assign(delay=t.delay.where(t.path != 3)),

@@ -20,12 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.section import RadioSettings
+from calibray.errors import InputError
 from calibray.materials import Material
 
 SCHEMA: Final = "calibray.request"
 VERSION: Final = 1
 ANSWER: Final = "path_loss_db"
 OBSERVABLES: Final = "observables"
+RESPONSE: Final = "its response"
+"""Name of the response in messages."""
+
+RAY_COLUMNS: Final = ("path", "point")
+"""Columns of a ray table that a response with path loss does not have."""
 PATH_LOSS_DB: Final = (20.0, 300.0)  # range of a plausible answer
 RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response: fixed part, and per link
 RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: a few hundred paths per link
@@ -180,9 +186,22 @@ def read_rays(path: Path, num_links: int) -> bytes:
     """The response of a program that returns a ray table.
 
     Raises:
-        Unusable: The file is missing, not a regular file, or too large.
+        Unusable: The file is missing, not a regular file, or too large, or contains no ray table.
     """
-    return _read_bytes(path, RAYS_BYTES[0] + RAYS_BYTES[1] * num_links)
+    from calibray.engines.rays.table import RayTable, parse_rays
+
+    response = _read_bytes(path, RAYS_BYTES[0] + RAYS_BYTES[1] * num_links)
+    try:
+        table = parse_rays(response, RESPONSE)
+        if ANSWER in table.frame and RAY_COLUMNS[0] not in table.frame:
+            raise Unusable(
+                f"{RESPONSE} contains {ANSWER}, which is path loss instead of a ray table; remove rays = true from "
+                "[engine], or return a ray table"
+            )
+        RayTable.of(table)
+    except InputError as error:
+        raise Unusable(str(error)) from None
+    return response
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
@@ -214,7 +233,8 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
     except RecursionError:
         raise Unusable("its response nests lists or objects too deeply") from None
     if not isinstance(content, dict) or name not in content:
-        raise Unusable(f"its response has no key {name!r}")
+        rows = content[0] if isinstance(content, list) and content else content
+        raise Unusable(f"its response has no key {name!r}{_rays_hint(rows)}")
     entries = content[name]
     # MATLAB writes a list of one number as that number.
     entries = entries if isinstance(entries, list) else [entries]
@@ -226,6 +246,12 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
             )
         return np.array(rows)
     return np.array([_number(entry, name) for entry in entries])
+
+
+def _rays_hint(names: Any) -> str:
+    """The remedy if a response with these names is a ray table; otherwise empty."""
+    is_table = isinstance(names, dict | list) and all(name in names for name in RAY_COLUMNS)
+    return "; it is a ray table: set rays = true in [engine]" if is_table else ""
 
 
 def _number(entry: Any, name: str) -> float:
@@ -245,7 +271,7 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
         with h5py.File(BytesIO(response), "r") as file:
             link = file.get(name, getlink=True)
             if link is None:
-                raise Unusable(f"its response has no dataset {name!r}")
+                raise Unusable(f"its response has no dataset {name!r}{_rays_hint(list(file))}")
             if not isinstance(link, h5py.HardLink):
                 raise Unusable(
                     f"its response links {name!r} to another object; write the numbers instead of the link"

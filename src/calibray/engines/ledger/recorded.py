@@ -106,8 +106,7 @@ class Recorded:
         answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
         failures = [answer.failure for answer in answers if answer.failure]
         if first and len(failures) == len(answers):  # the caller ends the run with the reason
-            if not self._ledger.read_only:
-                self._ledger.forget_failures(self._problem)
+            self.forget_failures()
         elif failures and not self._warned:
             self._warned = True
             _LOG.warning(
@@ -116,6 +115,11 @@ class Recorded:
                 command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
             )  # fmt: skip
         return answers, first
+
+    def forget_failures(self) -> None:
+        """Delete the failed calls of the problem if the ledger can be written, so that the next run repeats them."""
+        if not self._ledger.read_only:
+            self._ledger.forget_failures(self._problem)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Yield answers from the ledger, or otherwise from the engine, until `stop` is set; see `Answering.answers`."""

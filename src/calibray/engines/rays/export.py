@@ -8,6 +8,7 @@ from typing import Final, final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.engines.external.exchange import RESPONSE
 from calibray.engines.ledger.database import key
 from calibray.engines.ledger.recorded import Recorded
 from calibray.engines.protocol import Answering, check_candidates
@@ -18,9 +19,6 @@ from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.parameters import Parameters
 from calibray.paths import Paths
-
-RESPONSE: Final = "its response"
-"""Name of the response in messages."""
 
 FAINT: Final = 0.1
 """Constant added to every path's share of its link's power, so that weak paths keep a small weight."""
@@ -111,9 +109,11 @@ class Exporting:
         if (name := key(candidate)) not in self._exports:
             (answer,) = self._engine.answers(check_candidates(candidate[None], len(self.parameters)))
             if answer.failure:
+                # The run ends, so the next run must repeat the call.
+                if isinstance(self._engine, Recorded):
+                    self._engine.forget_failures()
                 raise EngineError(
-                    f"{answer.failure}. Ray mapping needs this call. Correct the program, remove the failure with "
-                    "`calibray ledger DIR --forget-failed`, and start again"
+                    f"{answer.failure}. Ray mapping needs this call: correct the program, and start again"
                 )
             self._exports[name] = Export.of(self._study, answer.rays)
         return self._exports[name]

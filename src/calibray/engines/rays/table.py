@@ -54,7 +54,7 @@ MISSPELT: Final = 0.8
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
 """Largest number of points of a path: the largest number of interactions of a trace, plus both ends."""
 
-NO_POWER: Final = {"power_db": "-inf", "gain_real": "0", "gain_imag": "0"}
+NO_POWER: Final = {"power_db": "-inf (-10000 in JSON)", "gain_real": "0", "gain_imag": "0"}
 """Values in these columns for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
@@ -199,6 +199,11 @@ def _with_known_names(table: SourceTable) -> SourceTable:
                 f"{table.source}: column {shortened(text)!r} is unknown and would be ignored; did you mean {meant!r} "
                 "(docs/reference/ray-table.md)? Use this name and its unit, or remove the column"
             )
+    if missing := [name for name in REQUIRED if name not in names]:
+        raise InputError(
+            f"{table.source}: has no column {missing[0]!r}, which every ray table must have "
+            "(docs/reference/ray-table.md); add it"
+        )
     return replace(table, frame=table.frame.set_axis(names, axis=1))
 
 
