@@ -23,8 +23,8 @@ PAGES: Final = {
 """Title and commands of every page."""
 
 HEAD: Final = """Data goes to stdout, progress and messages to stderr. The exit status is 0 for success, 1 for a failure
-at run time, 2 for bad input, and 130 after Ctrl-C. Progress is a bar on a terminal, and otherwise a line every few
-seconds. `python tools/command_line.py` writes this page from the commands.
+at run time, 2 for bad input, 130 after Ctrl-C, and 143 after SIGTERM. Progress is a bar on a terminal, and otherwise a
+line every few seconds. `python tools/command_line.py` writes this page from the commands.
 """
 
 

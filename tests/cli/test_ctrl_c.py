@@ -149,3 +149,32 @@ def test_ctrl_c_prints_the_kept_calls_and_the_same_command_continues(monkeypatch
     assert re.search(rf"found in the ledger +{kept - 1}\n", again.stdout)
     assert len(programs.calls(tmp_path)) == calls_before + 9 - kept
     assert "\x1b" not in again.stderr  # no terminal, no bars
+
+
+def test_sigterm_prints_the_kept_calls_even_if_ctrl_c_is_ignored(tmp_path):
+    """A scheduler sends it to a job in the background; the status is 143, and no program is left."""
+    content = programs.content(tmp_path, before="import time; time.sleep(0.3)")
+    write_study(tmp_path, content | {"method": {"name": "random", "options": {"budget": 200}}})
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from calibray.cli import main; main()"
+    )
+    words = [sys.executable, "-c", code, "run", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]
+    environment = {**os.environ, "CALIBRAY_CACHE": ""}
+    process = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while kept_calls(tmp_path / "out") < 2 and time.monotonic() < deadline:
+            time.sleep(0.1)
+        process.terminate()
+        _, printed = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    assert process.returncode == 143, printed
+    assert f"Kept: {kept_calls(tmp_path / 'out')} RT calls in" in printed
+    assert "Start the same command again to continue" in printed
+    assert "Traceback" not in printed
+    started = len(programs.calls(tmp_path))
+    time.sleep(1.0)
+    assert len(programs.calls(tmp_path)) == started

@@ -8,7 +8,7 @@ import sys
 import warnings
 from typing import NoReturn
 
-from calibray.support.interruption import INTERRUPTED
+from calibray.support.interruption import INTERRUPTED, TERMINATED, exit_status
 
 __all__ = ["main"]
 
@@ -24,7 +24,7 @@ def main() -> None:
     except KeyboardInterrupt:
         _leave()
     except SystemExit as end:
-        if end.code == INTERRUPTED:
+        if end.code in (INTERRUPTED, TERMINATED):
             _leave()
         raise
 
@@ -34,4 +34,4 @@ def _leave() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
-    os._exit(INTERRUPTED)
+    os._exit(exit_status())

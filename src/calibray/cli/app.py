@@ -1,8 +1,8 @@
 """The application: its commands and its error handling.
 
 Data are written to stdout; progress and messages are written to stderr. The exit status is 0 for success, 1 for a
-failure while running, 2 for bad input and 130 for Ctrl-C. Each command imports its dependencies when it runs, so that
-`--version` responds immediately.
+failure while running, 2 for bad input, 130 for Ctrl-C and 143 for SIGTERM. Each command imports its dependencies when
+it runs, so that `--version` responds immediately.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calibray.cli.run import demo, export, report, run, trace
 from calibray.cli.scene import scene
 from calibray.cli.validate import compare, validate
 from calibray.errors import EngineError, InputError
-from calibray.support.interruption import INTERRUPTED, ensure_interruption
+from calibray.support.interruption import ensure_interruption, exit_status, interrupt_on_termination
 from calibray.support.memory import check_address_space
 
 LONGEST: Final = 4096
@@ -45,12 +45,12 @@ class Commands(TyperGroup):
 
         Raises:
             typer.Exit: With status 2 for bad input, 1 if an engine failed or a file could not be read or written, and
-                130 for Ctrl-C.
+                130 for Ctrl-C, 143 for SIGTERM.
             BrokenPipeError: The reader of stdout has closed the stream; Typer handles this error.
         """
         try:
             check_address_space()
-            with ensure_interruption():
+            with interrupt_on_termination(), ensure_interruption():
                 return super().invoke(ctx)
         except InputError as error:
             echo(f"Error: {error}", err=True)
@@ -75,7 +75,7 @@ class Commands(TyperGroup):
             if isinstance(error.__cause__, (InputError, EngineError)):
                 echo(f"Error: {error.__cause__}", err=True)
             echo("Interrupted", err=True)
-            raise typer.Exit(INTERRUPTED) from error
+            raise typer.Exit(exit_status()) from error
 
 
 app = typer.Typer(

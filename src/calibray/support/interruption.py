@@ -13,6 +13,9 @@ from typing import Final
 INTERRUPTED: Final = 128 + signal.SIGINT
 """Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
+TERMINATED: Final = 128 + signal.SIGTERM
+"""Exit status after SIGTERM, which schedulers and `timeout` send."""
+
 GRACE: Final = 1.0
 """Time for an interruption to reach the code that saves results, before the interruption is raised again [s]."""
 
@@ -96,6 +99,44 @@ def _press(_: int, __: FrameType | None) -> None:
 
 
 @contextmanager
+def interrupt_on_termination() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C within the block, even if Ctrl-C is ignored, as in a background job.
+
+    Yields:
+        Nothing. Outside the main thread, or if another handler for SIGTERM is set, the block runs unchanged.
+
+    Raises:
+        KeyboardInterrupt: The process received SIGTERM; `exit_status` then returns `TERMINATED`.
+    """
+    handled = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    )
+    if handled:
+        _terminated.clear()
+        signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        if handled:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def exit_status() -> int:
+    """The exit status after an interruption: `TERMINATED` after SIGTERM, otherwise `INTERRUPTED`."""
+    return TERMINATED if _terminated else INTERRUPTED
+
+
+_terminated: list[int] = []  # the numbers of the signals received within `interrupt_on_termination`
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    _terminated.append(number)
+    handler = signal.getsignal(signal.SIGINT)
+    (handler if callable(handler) else _press)(number, frame)
+
+
+@contextmanager
 def defer_interruption() -> Iterator[None]:
     """Delay Ctrl-C until the end of a short block that must not be interrupted.
 
@@ -112,4 +153,4 @@ def defer_interruption() -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, handler)
         if pressed:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(pressed[0])
