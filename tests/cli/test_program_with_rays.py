@@ -15,6 +15,8 @@ from calibray.calibration.result import Result
 from calibray.engines.rays.export import Exporting
 from calibray.errors import EngineError, InputError
 from calibray.fitting import ray_fit
+from calibray.reporting.ledger_paths import with_stored_paths
+from calibray.reporting.page import collect
 from calibray.result.held_out import Model
 from calibray.study.toml_file import study_text
 from commands import run
@@ -163,8 +165,16 @@ def test_predictions_and_the_page_show_the_rays_of_the_program(
     program.write_text(correct)
     before = calls(folder)
     assert run("report", folder / "out", "-o", tmp_path / "report.html").exit_code == 0
-    assert "The model represents the program" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "The model represents the program" in page
     assert calls(folder) == before
+    # The rays come from the ledger; without it, the page states what is missing.
+    assert "Not shown" not in page
+    absent = with_stored_paths(result, tmp_path / "ledger.sqlite")
+    assert collect(absent).missing == ("Paths: the paths of the engine command are not in the ledger.",)
+    drawn = collect(with_stored_paths(result, folder / "out" / "ledger.sqlite")).rays
+    assert drawn is not None
+    assert drawn.traced == 32
 
 
 def test_a_program_of_other_physics_is_not_understood(

@@ -309,12 +309,14 @@ def report(
     """Write a result as one HTML file: summary, values, figures, map, and the scene in 3-D."""
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
+        from calibray.engines.ledger.ledger import LEDGER_FILE
+        from calibray.reporting.ledger_paths import with_stored_paths
         from calibray.reporting.page import FIGURES, FILE
         from calibray.reporting.page import report as write_report
 
         result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         file = write_report(
-            result,
+            with_stored_paths(result, folder / LEDGER_FILE),
             out or folder / FILE,
             figures=folder / FIGURES if figures else None,
             overwrite=permissions.overwrite,

@@ -157,7 +157,8 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
     triangles = None if scene is None else read_triangles(scene)
     drawn = None
     if study.engine.external and result.paths is None:
-        missing.append(f"Paths: the paths of the engine {study.engine.name} are not stored.")
+        reason = "are not in the ledger" if study.engine.exports_rays else "are not part of its answers"
+        missing.append(f"Paths: the paths of the engine {study.engine.name} {reason}.")
     else:
         try:
             drawn = rays(result, progress)
