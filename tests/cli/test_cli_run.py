@@ -17,10 +17,12 @@ import programs
 from calibray.calibration.result import Result
 from calibray.cli.console import progress_bars
 from calibray.cli.predict import _columns
+from calibray.cli.validate import _unused_text
 from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.reporting import result_tables
 from calibray.result.files import FILES
+from calibray.result.held_out import Model
 from calibray.support.output_files import SIGNATURES, write_text
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
@@ -244,6 +246,16 @@ def test_a_validation_is_not_written_into_a_result_of_changed_links(folder, ran)
         file.write_text(before)
     assert (outcome.exit_code, outcome.stdout) == (2, "")
     assert "links.csv changed since its result was calibrated; run the study again" in outcome.stderr
+
+
+def test_a_model_that_predictions_do_not_use_yet_is_named(folder, ran, tmp_path):
+    out = folder / "out"
+    used = Result.load(out).prediction.model.name
+    other = next(name for name in (Model.INITIAL, Model.LOG_DISTANCE) if name != used)
+    assert f"the model {str(other)!r} is chosen, but predictions do not use it yet" in _unused_text(
+        out, other
+    )
+    assert _unused_text(out, used) == _unused_text(tmp_path, other) == ""
 
 
 @pytest.mark.parametrize(

@@ -424,3 +424,19 @@ def test_a_study_without_a_program_is_refused(tmp_path):
     replay = Study.from_content(content | {"engine": {"name": "replay"}}, tmp_path / "study.toml")
     with pytest.raises(InputError, match="requires command, the program"):
         engines.make(replay, "command")
+
+
+def test_answers_in_another_order_have_a_remark(tmp_path):
+    method = {"name": "random", "model": "none", "options": {"budget": 6}}
+    study = Study.from_content(
+        programs.content(tmp_path, "losses = losses[1:] + losses[:1]") | {"method": method},
+        tmp_path / "study.toml",
+    )
+    texts = [text for text in calibrate(study).remarks if "worse than a constant" in text]
+    assert len(texts) == 1
+    assert (
+        "Check that the program answers in the order of the links, units, and the coordinate frame"
+        in texts[0]
+    )
+    study = Study.from_content(programs.content(tmp_path) | {"method": method}, tmp_path / "study.toml")
+    assert "worse than a constant" not in " ".join(calibrate(study).remarks)

@@ -91,7 +91,9 @@ def test_the_order_of_rows_and_the_axes_do_not_matter(
     np.testing.assert_array_equal(path_loss(read(shuffled, yard)), path_loss(read(rows, yard)))
     upright = rows.assign(y=rows.z, z=-rows.y)
     np.testing.assert_allclose(path_loss(read(upright, yard, axes="x -z y")), path_loss(traced), atol=1e-5)
-    with pytest.raises(InputError, match=r"lies .* m from the nearest surface.*argument axes"):
+    with pytest.raises(
+        InputError, match=r"lies .* m from the nearest surface.*order and signs of x, y and z"
+    ):
         read(upright, yard)
 
 

@@ -18,13 +18,15 @@ from calibray.reporting.figures import cumulative_cost
 from calibray.reporting.page import _laws, _tiles
 from calibray.reporting.summary import summary
 from calibray.reporting.wording import (
+    _neighbours_text,
     carriers_text,
     diagnostics_table,
     method_text,
     prediction_text,
     scene_alone_text,
 )
-from calibray.result.held_out import Model
+from calibray.result.held_out import Model, ResidualField
+from calibray.result.verdict import Interval, Verdict
 from calibray.study import Study
 from calibray.tables import render
 from calibray.tracing.protocol import EnclosedAntennas
@@ -76,6 +78,11 @@ def test_the_result_of_an_external_program_names_its_method_its_failures_and_its
         replace(result, history=history)
     ).rows
     assert "Predictions and maps call the program" in scene_alone_text(result)
+    # `calibray suggest` refuses such a result.
+    name = next(iter(result.parameters))
+    ambiguous = {"draws": {name: [2.0, 8.0]}, "intervals": {name: Interval(1.0, 2.0, 8.0, Verdict.AMBIGUOUS)}}
+    advised = [changed(each, **ambiguous) for each in (shown.result(), result)]
+    assert ["calibray suggest" in str(summary(each)) for each in advised] == [True, False]
     assert "differs from the predictions" in scene_alone_text(shown.result())
 
 
@@ -183,3 +190,15 @@ def test_the_line_of_the_surrogate_is_after_the_last_full_iteration():
 def test_times_are_written_without_an_exponent():
     for seconds, text in ((0.034, "0.034 s"), (98.4, "98 s"), (99.7, "2 min"), (1500.0, "25 min")):
         assert f"RT calls in {text}, after" in summary(changed(shown.result(), seconds=seconds))[1].text
+
+
+def test_sentences_about_correlated_errors_agree():
+    """The nearest pairs alone show no correlation, but the fitted model, which predictions use, has one."""
+    field, table = ResidualField(range_m=20.0, shared_db=1.0, own_db=1.0), pd.DataFrame({
+        "distance_m": [10.0, 20.0, 30.0, 40.0], "semivariance_db2": [2.0] * 4, "pairs": [9] * 4,
+    })  # fmt: skip
+    assert _neighbours_text(table, None) == "the errors of links 10 m apart show no significant correlation"
+    assert _neighbours_text(table, field) == "links 10 m apart share 30 % of the variance of their errors"
+    result = shown.result()
+    near = replace(result, prediction=replace(result.prediction, residual_field=field))
+    assert "(standard deviation in the fitted model: 1.00 dB)" in scene_alone_text(near)

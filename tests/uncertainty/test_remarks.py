@@ -9,7 +9,7 @@ import pytest
 
 import planted
 from calibray.fitting.problem import Problem
-from calibray.result.verdict import Interval, RemarkKind, Verdict
+from calibray.result.verdict import Interval, Remark, RemarkKind, Verdict
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.uncertainty.noise_models import CORRELATED
@@ -40,7 +40,7 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     (text,) = remarks(outside)
     assert f"{NAMES[1]} 4.4, interval 2 to 3, 6 to 9, most probable 7" in text
     assert NAMES[0] not in text
-    assert "neighbouring links share part of their errors" in text
+    assert "neighbouring links have less weight than independent links if they share part" in text
     assert f"{np.exp(3.0):.2g} times as probable" in text
     assert "unless another model is chosen on held-out links ([holdout])" in text
     # With blocks held out already, that advice would be empty.
@@ -99,3 +99,11 @@ def test_the_remark_on_errors_out_of_sight_advises_what_the_study_lacks(trace, a
     study = Study.from_content(planted.content("links.csv", trace=trace))
     (remark,) = departures({"out_of_sight": 1.0}, study)
     assert remark_text(remark).endswith(advice)
+
+
+def test_the_method_auto_is_not_advised_to_itself():
+    values = {"draws_db": 1.0, "found_db": 2.0, "start_db": 1.0}
+    for kind in (RemarkKind.MISSED_OPTIMUM, RemarkKind.WORSE_THAN_START):
+        own, other = (remark_text(Remark(kind, values | {"method": name})) for name in ("auto", "random"))
+        assert own.endswith("Use a larger budget (method.options).")
+        assert other.endswith("Use a larger budget (method.options), or the method 'auto'.")

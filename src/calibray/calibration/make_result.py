@@ -175,6 +175,9 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
                 *([cheap.remark] if cheap.remark else []),
                 *run.on_links,
                 *_worse_than_start(problem, trail, nuisance_only if fitted else models.initial),
+                *_worse_than_mean(
+                    problem, trail.best_rmse_db, rmse_of(problem, models.log_distance, counted)
+                ),
                 *certainty.record.remarks,
                 *_retraced(gap_db, counted, study.fidelity.tolerance_db),
                 *_not_judged(study, accuracy),
@@ -236,6 +239,22 @@ def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float
     kept = bool(trail.best_rmse_db < found)
     values = {"start_db": start, "found_db": found, "method": study.method.name, "kept": kept}
     return (Remark(RemarkKind.WORSE_THAN_START, values),)
+
+
+def _worse_than_mean(problem: Problem, found_db: float, log_distance_db: float) -> tuple[Remark, ...]:
+    """A remark if the calibrated model fits worse than the mean measured path loss, as if links were confused."""
+    objective = problem.objective
+    mean = np.average(objective.measured, weights=objective.weight)
+    mean_db = rmse_of(problem, np.full(problem.num_links, mean), objective.weight > 0)
+    if not found_db > mean_db:
+        return ()
+    values: dict[str, Value] = {
+        "found_db": found_db,
+        "mean_db": mean_db,
+        "log_distance_db": log_distance_db,
+        "program": problem.setup.study.engine.external,
+    }
+    return (Remark(RemarkKind.WORSE_THAN_MEAN, values),)
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:

@@ -82,8 +82,22 @@ def validate(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         write_validation(validation, study, out, validation.content())
+        if note := _unused_text(out, validation.chosen):
+            echo(f"Note: {note}", err=True)
         following = f"; next: {command('report', out)}" if (out / RESULT_FILE).is_file() else ""
         echo(f"Written to {out / VALIDATION_FILE}{following}", err=True)
+
+
+def _unused_text(folder: Path, chosen: str) -> str:
+    """A note if the folder has a result whose predictions do not use the chosen model; otherwise empty."""
+    from calibray.calibration.result import Result
+    from calibray.result.files import RESULT_FILE
+    from calibray.result.wording import unused_choice_text
+
+    if not (folder / RESULT_FILE).is_file():
+        return ""
+    used = Result.load(folder, allow_changed_inputs=True).prediction.model.name
+    return "" if used == chosen else unused_choice_text(chosen)
 
 
 def _check_same_inputs(setup: Setup, folder: Path) -> None:

@@ -17,7 +17,7 @@ from calibray.reporting.wording import (
 )
 from calibray.result.record import Record
 from calibray.result.verdict import RemarkKind, Verdict
-from calibray.result.wording import NOT_JUDGED, UNKNOWN_BEST, judgement_text, remark_text
+from calibray.result.wording import NOT_JUDGED, UNKNOWN_BEST, judgement_text, remark_text, unused_choice_text
 from calibray.support.messages import counted
 from calibray.tables import named, rows_text
 from calibray.validation.validation import Validation
@@ -103,10 +103,7 @@ def _held_out_accuracy(result: Record) -> Sentence:
         best_db = validation.table["rmse_db"].min()
         text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
         if validation.chosen != result.prediction.model.name:
-            text += (
-                f" On the blocks, the model {str(validation.chosen)!r} is chosen, but predictions do not use it yet. "
-                "To use it, run the study again with [holdout] blocks."
-            )
+            text += f" {unused_choice_text(validation.chosen)}"
     if judgement is None:
         by_filter = f"{UNKNOWN_BEST} Hold out links with [holdout] where."
         return Sentence(heading, NOT_JUDGED if result.study.allows_blocks else by_filter, "caution")
@@ -163,7 +160,9 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
     # Paths do not interact with the owners of other parameters, such as antennas.
     materials = [name for name in owners if name in result.materials]
     sentences = []
-    if result.uncertainty.draws and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
+    # Suggestions need derivatives, which programs do not provide.
+    ranked = result.uncertainty.draws and not result.study.engine.external
+    if ranked and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
         sentences.append(
             "calibray suggest DIR CANDIDATES ranks candidate positions by the expected effect of a measurement there "
             "on the widths of the intervals."

@@ -13,7 +13,7 @@ from calibray.measurements import FEW
 from calibray.measurements.column_names import find_frequency_unit
 from calibray.optimizers import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
-from calibray.result.held_out import HeldOutErrors, Model
+from calibray.result.held_out import HeldOutErrors, Model, ResidualField
 from calibray.result.record import Record
 from calibray.study.calibration_sections import OFFSET
 from calibray.study.displacement import RECEIVER
@@ -93,7 +93,8 @@ def scene_alone_text(record: Record) -> str:
         ""
         if field is None
         else f" Within about {field.range_m:.3g} m of measured links, predictions also add the "
-        f"correlated part of their residuals ({field.shared_db:.2f} dB RMS), which a scene cannot contain."
+        "correlated part of their residuals, which a scene cannot contain (standard deviation in the fitted model: "
+        f"{field.shared_db:.2f} dB)."
     )
     if record.study.engine.external and model.parameters is not None:
         return (
@@ -194,7 +195,9 @@ def diagnostics_table(result: Record) -> Table:
         "by obstruction": text("obstruction", _obstruction_text),
         "by street": _class_text(tables, "streets", str),
         "missing region": text("missing_region", _missing_region_text),
-        "neighbours": text("neighbours", _neighbours_text),
+        "neighbours": text(
+            "neighbours", lambda table: _neighbours_text(table, result.prediction.residual_field)
+        ),
         "leverage": text("leverage", _leverage_text),
         "trade-offs": text("trade_offs", lambda table: _trade_offs_text(result, table)),
         "largest change": text("moved", _moved_text),
@@ -267,7 +270,7 @@ def _missing_region_text(table: pd.DataFrame) -> str:
     )
 
 
-def _neighbours_text(table: pd.DataFrame) -> str:
+def _neighbours_text(table: pd.DataFrame, field: ResidualField | None) -> str:
     if len(table) < 3:
         return ""
     # Distant links share no errors, so half their mean squared difference is the full variance (the sill). Neighbours
@@ -276,7 +279,11 @@ def _neighbours_text(table: pd.DataFrame) -> str:
     share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
     # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
     if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
-        return f"the errors of links {nearest['distance_m']:.0f} m apart are not correlated"
+        if field is None:
+            return f"the errors of links {nearest['distance_m']:.0f} m apart show no significant correlation"
+        # The fitted model uses all pairs, so it can detect a correlation that the nearest pairs alone do not show.
+        decay = np.exp(-nearest["distance_m"] / field.range_m)
+        share = decay * field.shared_db**2 / (field.shared_db**2 + field.own_db**2)
     return f"links {nearest['distance_m']:.0f} m apart share {percent(share)} of the variance of their errors"
 
 

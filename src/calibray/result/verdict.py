@@ -118,8 +118,10 @@ class RemarkKind(StrEnum):
     RICHER_PATHS = "richer paths"
     HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight
     UNDECLARED_OFFSET = "undeclared offset"  # offset_db, error_db, rmse_db, rmse_without_db
-    MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db
+    MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db, method: its name
     WORSE_THAN_START = "worse than start"  # start_db, found_db, method: its name, kept
+    # found_db, mean_db, log_distance_db; program: whether an external program computes path loss
+    WORSE_THAN_MEAN = "worse than mean"
     # names, values, pieces (lower and upper ends in turn), most_probable, cause, odds, blocks
     OUTSIDE_INTERVAL = "outside interval"
     FEW_DRAWS = "few draws"

@@ -170,7 +170,7 @@ def _richer_paths(values: dict[str, Any]) -> str:
 
 
 _CAUSES: Final = {
-    "correlated": "neighbouring links share part of their errors, so they have less weight than independent links",
+    "correlated": "neighbouring links have less weight than independent links if they share part of their errors",
     "out_of_sight": "weak links out of sight have less weight if the scene lacks paths to them",
     "student-t": "outliers have less weight if the noise has heavy tails",
     "heterogeneous": "links that depend on single buildings have less weight if buildings differ",
@@ -355,6 +355,25 @@ def _retraced(values: dict[str, Any]) -> str:
     )
 
 
+def _worse_than_mean(values: dict[str, Any]) -> str:
+    order = (
+        "that the program answers in the order of the links" if values["program"] else "the rows of the table"
+    )
+    return (
+        f"The calibrated model fits the links worse than a constant: its RMSE is {values['found_db']:.2f} dB, that of "
+        f"the mean measured path loss {values['mean_db']:.2f} dB, and that of the log-distance model "
+        f"{values['log_distance_db']:.2f} dB. Do not use the result. Check {order}, units, and the coordinate frame of "
+        "links and scene."
+    )
+
+
+def _larger_budget(values: dict[str, Any]) -> str:
+    # Results of earlier versions do not name the method.
+    return "Use a larger budget (method.options)" + (
+        "." if values.get("method") == "auto" else ", or the method 'auto'."
+    )
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their errors"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -371,16 +390,15 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.MISSED_OPTIMUM: lambda values: (
         f"The method missed the optimum: posterior draws reach an RMSE of {values['draws_db']:.2f} dB, but the "
         f"method reached {values['found_db']:.2f} dB. The intervals describe the optimum, not the values that were "
-        "found. Use the method 'auto', or a larger budget."
+        f"found. {_larger_budget(values)}"
     ),
     RemarkKind.WORSE_THAN_START: lambda values: (
         f"The method did not improve on the initial values: they have an RMSE of {values['start_db']:.2f} dB, and the "
         f"best candidate of the method has {values['found_db']:.2f} dB. "
         + ("The result has the initial values. " if values.get("kept") else "Do not use the result. ")
-        # Results of earlier versions do not name the method.
-        + "Use a larger budget (method.options)"
-        + ("." if values.get("method") == "auto" else ", or the method 'auto'.")
+        + _larger_budget(values)
     ),
+    RemarkKind.WORSE_THAN_MEAN: _worse_than_mean,
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
         "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing, so "
@@ -441,6 +459,14 @@ def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
     return (
         f"{used}{preferred}{near}. The model {str(best)!r} is better on held-out blocks, but by too little to be "
         "preferred."
+    )
+
+
+def unused_choice_text(chosen: str) -> str:
+    """A note that a validation after the run has chosen a model that predictions do not use."""
+    return (
+        f"On the blocks, the model {str(chosen)!r} is chosen, but predictions do not use it yet. To use it, run the "
+        "study again with [holdout] blocks."
     )
 
 

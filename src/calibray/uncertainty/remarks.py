@@ -217,7 +217,9 @@ def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remar
     lowest = float(problem.squares(top).value.min())
     if lowest > best_value - MISSED_DB:
         return ()
-    return (Remark(RemarkKind.MISSED_OPTIMUM, {"draws_db": lowest, "found_db": best_value}),)
+    method = problem.setup.study.method.name
+    values: dict[str, Value] = {"draws_db": lowest, "found_db": best_value, "method": method}
+    return (Remark(RemarkKind.MISSED_OPTIMUM, values),)
 
 
 def outside_interval(

@@ -301,7 +301,7 @@ def _assign_links(
         )
         if lost.all():
             raise InputError(
-                f"{fault}; check units [m], export the rays of the given links, or correct the argument axes"
+                f"{fault}; check units [m], and order and signs of x, y and z, or export the rays of the given links"
             )
         _LOG.warning("%s; these paths are omitted", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)

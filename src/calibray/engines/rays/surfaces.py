@@ -164,7 +164,7 @@ def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names:
     return InputError(
         f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface} "
         f"but must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check units [m], "
-        "axes (argument axes), scene and material"
+        "order and signs of x, y and z, scene and material"
     )
 
 
