@@ -100,7 +100,7 @@ def test_an_offset_is_named_as_the_difference_between_scene_and_predictions(othe
     field = replace(same.prediction, residual_field=ResidualField(range_m=12.0, shared_db=2.5, own_db=1.0))
     near = scene_alone_text(replace(same, prediction=field))
     assert "Within about 12 m of measured links" in near
-    assert "2.50 dB RMS" in near
+    assert "(standard deviation in the fitted model: 2.50 dB)" in near
     assert scene_alone_text(replace(other, prediction=field)).endswith(near)
     assert "calibrated" in prediction_text(shown.result())
 
