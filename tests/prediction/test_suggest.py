@@ -313,10 +313,14 @@ def test_fewer_candidates_than_requested_are_counted_in_a_warning(result, table,
     assert "2 suggestions instead of 10: only 2 of 2 candidates have a path and enough power" in caplog.text
 
 
-def test_candidates_below_the_noise_floor_are_left_out(folder, result, table, caplog):
+@pytest.mark.parametrize("above_db", [1.0, 6.0])
+def test_candidates_as_near_the_noise_floor_as_the_calibration_leaves_out_are_left_out(
+    folder, result, table, caplog, above_db
+):
+    """Eight errors above the floor, or as near as the weakest link of a calibration that uses nearer links."""
     measured = pd.read_csv(folder / "links.csv")
     measured.assign(rsrp_dbm=-measured.path_loss_db).to_csv(folder / "powers.csv", index=False)
-    floor = -float(measured.path_loss_db.max()) - 0.5
+    floor = -float(result.links.after_db.max()) - above_db
     content = study(folder).content()
     content["links"] |= {
         "file": "powers.csv",
@@ -326,14 +330,20 @@ def test_candidates_below_the_noise_floor_are_left_out(folder, result, table, ca
     }
     powers = changed(result, study=Study.from_content(content, folder / "powers.toml"))
     every = cb.suggest(result, table, len(table))
-    weak = every.path_loss_db >= -floor
-    assert 0 < weak.sum() < len(table)
+    margin = min(8 * result.rmse_db * np.sqrt(14 / 12), above_db)
+    weak = every.path_loss_db >= -floor - margin
+    assert (every.path_loss_db >= -floor).sum() < weak.sum() < len(table)
     assert set(cb.suggest(powers, table, len(table)).row) == set(every.row[~weak])
-    assert f"{weak.sum()} of 25 candidates are left out" in caplog.text
+    reason = f"less than {margin:.1f} dB above links.noise_floor_dbm = {floor:g}, and the calibration uses no"
+    assert f"{weak.sum()} of 25 candidates are left out: their predicted power is {reason}" in caplog.text
     with pytest.raises(
-        InputError, match=rf"all {weak.sum()} candidates .* not above links.noise_floor_dbm = "
+        InputError, match=rf"all {weak.sum()} candidates .* is less than {margin:.1f} dB above"
     ):
         cb.suggest(powers, table[table.rx_x.isin(every.rx_x[weak])])
+    content["links"]["below_floor"] = "censor"
+    censored = changed(result, study=Study.from_content(content, folder / "powers.toml"))
+    weak = every.path_loss_db >= -floor
+    assert set(cb.suggest(censored, table, len(table)).row) == set(every.row[~weak])
 
 
 def test_where_two_ranges_fit_the_first_suggestion_distinguishes_them(result, table):

@@ -14,7 +14,12 @@ from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable, Observing
 from calibray.errors import InputError
 from calibray.fitting.nuisance import UNKNOWN_DB, Term
-from calibray.fitting.preliminary_fits import LEAST_NOISE_DB, with_estimated_errors, with_estimated_spreads
+from calibray.fitting.preliminary_fits import (
+    LEAST_NOISE_DB,
+    MARGIN,
+    with_estimated_errors,
+    with_estimated_spreads,
+)
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
 from calibray.measurements.placement import POSITION_COLUMNS
@@ -72,8 +77,8 @@ def suggest(
     Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
     measurement adds no information. If they differ by more than the error of a link, a measurement rules out some
     draws. Candidates are chosen one at a time, each as the best addition to the earlier ones. Candidates with a mean
-    predicted power that is not above the study's noise floor are left out, and a warning in the log states their
-    number.
+    predicted power too near the study's noise floor, which a calibration would leave out, are left out. A warning in
+    the log states their number and the required margin.
 
     Args:
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
@@ -95,7 +100,7 @@ def suggest(
 
     Raises:
         InputError: `Result.predict` would refuse the input for a reason other than unknown groups; the calibration has
-            no draws; or no candidate has a path and a predicted power above the study's noise floor.
+            no draws; or no candidate has a path and a predicted power far enough above the study's noise floor.
     """
     if isinstance(count, bool) or not (isinstance(count, Integral) and count >= 1):
         raise InputError(f"count = {count!r}: must be a whole number of at least 1")
@@ -136,7 +141,8 @@ def suggest(
         raise InputError(
             f"{links.source}: none of {len(links)} candidates has a path; choose other positions"
         )
-    reached = _received(result, links, predicted[: model.num_draws].mean(axis=0), reached)
+    margin_db = model.floor_margin_db()
+    reached = _received(result, links, predicted[: model.num_draws].mean(axis=0), reached, margin_db)
     errors = replace(errors, common=errors.common[reached], position=errors.position[reached])
     beliefs = model.beliefs()
     outlooks = choose_candidates(beliefs, predicted[:, reached], slope[:, reached], errors, count)
@@ -160,31 +166,41 @@ def suggest(
 
 
 def _received(
-    result: Record, links: Measurements, path_loss_db: NDArray[np.float64], reached: NDArray[np.int64]
+    result: Record,
+    links: Measurements,
+    path_loss_db: NDArray[np.float64],
+    reached: NDArray[np.int64],
+    margin_db: float,
 ) -> NDArray[np.int64]:
-    """The candidates among `reached`, which have a path, with a predicted power above the study's noise floor.
+    """The candidates among `reached`, which have a path, with a predicted power above the noise floor by the margin.
 
     All remain if the study has no noise floor, or if the transmitted power of the candidates is unknown.
 
     Raises:
-        InputError: No candidate has a predicted power above the noise floor.
+        InputError: No candidate has enough predicted power.
     """
     floor = result.study.links.noise_floor_dbm
     powers = as_measured(result.study, links, pd.DataFrame({"path_loss_db": path_loss_db}))
     if floor is None or not powers:
         return reached
     (power,) = powers.values()
-    received = reached[power[reached] > floor]
-    below, highest = len(reached) - len(received), power[reached].max()
+    received = reached[power[reached] > floor + margin_db]
+    left_out, highest = len(reached) - len(received), power[reached].max()
+    reason = f"not above links.noise_floor_dbm = {floor:g}"
+    if margin_db:
+        reason = (
+            f"less than {margin_db:.1f} dB above links.noise_floor_dbm = {floor:g}, and the calibration uses no links "
+            "so near it"
+        )
     if not len(received):
         raise InputError(
-            f"{links.source}: the predicted power of all {below} candidates with a path, at most {highest:.1f} dBm, is "
-            f"not above links.noise_floor_dbm = {floor:g}; choose positions nearer to the transmitters"
+            f"{links.source}: the predicted power of all {left_out} candidates with a path, at most {highest:.1f} dBm, "
+            f"is {reason}; choose positions nearer to the transmitters"
         )
-    if below:
+    if left_out:
         LOG.warning(
-            "%s of %s candidates are left out: their predicted power is not above links.noise_floor_dbm = %g",
-            f"{below:,}", f"{len(links):,}", floor,
+            "%s of %s candidates are left out: their predicted power is %s",
+            f"{left_out:,}", f"{len(links):,}", reason,
         )  # fmt: skip
     return received
 
@@ -246,6 +262,19 @@ class _ReplayedDraws:
         coefficient_slopes = objective.coefficient_slopes(*self._replay(self.engine))
         path_loss_db = loss + coefficients @ design.T
         return path_loss_db, (slope + design @ coefficient_slopes)[: self.num_draws], errors
+
+    def floor_margin_db(self) -> float:
+        """Distance from the noise floor within which a calibration leaves out a link by its predicted path loss [dB].
+
+        It is that of `leave_out_near_floor`, or the smallest distance of a calibrated link if the calibration used a
+        smaller one. It is 0 without a noise floor. It is also 0 with censored links, because the draws then use links
+        near the floor.
+        """
+        links, counted = self.problem.setup.links, self.problem.objective.weight > 0
+        if links.limit_db is None or links.censored is not None:
+            return 0.0
+        distance_db = (links.limit_db - self.result.links["after_db"].to_numpy(float))[counted]
+        return float(np.clip(distance_db.min(), 0.0, MARGIN * self.noise_db))
 
     def worth(self, setup: Setup, index: NDArray[np.int64], information: NDArray[np.float64]) -> list[Worth]:
         """Further observables at suggested candidates; see `worth_measuring`.
