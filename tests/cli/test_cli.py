@@ -54,6 +54,10 @@ def failing_app():
         raise EngineError("the engine ended with 9")
 
     @commands.command()
+    def missing() -> None:
+        raise FileNotFoundError(2, "No such file or directory", "a.msi")
+
+    @commands.command()
     def mistake() -> None:
         raise ZeroDivisionError
 
@@ -93,6 +97,7 @@ def test_a_wrong_command_line_is_bad_input(arguments):
     [
         ("bad-input", 2, "Error: links.csv, row 3: path_loss is -4\n"),
         ("engine-failure", 1, "Error: the engine ended with 9\n"),
+        ("missing", 1, "Error: a.msi: file not found; restore it, or correct its path\n"),
     ],
 )
 def test_an_expected_failure_is_one_message(failing_app, command, status, message):

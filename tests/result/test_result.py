@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 
 import numpy as np
 import pandas as pd
@@ -53,15 +54,17 @@ def folder(result, tmp_path):
     return tmp_path / "new" / "out"
 
 
-def test_a_result_that_moved_with_its_study_reads_the_files_there(result, tmp_path):
+def test_a_result_that_was_copied_with_its_study_reads_the_files_there(result, tmp_path):
     before, after = tmp_path / "before", tmp_path / "after"
     before.mkdir()
     (before / "study.toml").touch()
     here = Study.from_content(result.study.content(), before / "study.toml")
     replace(result, study=here).save(before / "out")
     assert Result.load(before / "out").study.path == before / "study.toml"
-    before.rename(after)
-    assert Result.load(after / "out").study.path.resolve() == after / "study.toml"
+    copytree(before, after)
+    assert Result.load(after / "out").study.path == after / "study.toml"
+    copytree(before / "out", tmp_path / "alone" / "out")
+    assert Result.load(tmp_path / "alone" / "out").study.path == before / "study.toml"
 
 
 def test_what_is_saved_is_what_is_loaded(result, folder):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.study.mounting import largest_gain_dbi
+from calibray.study.setup import input_digests
 from calibray.tracing.antennas import AntennaPattern, stated_jones
 from calibray.tracing.settings import Antenna
 from link_tables import links_from_frame
@@ -105,6 +108,20 @@ def test_the_largest_gain_of_an_array_may_lie_in_a_side_lobe(tmp_path: Path) -> 
     direction = np.stack([np.cos(down), 0 * down, np.sin(down)], axis=-1)
     power = (np.abs(AntennaPattern.of(antenna).jones_vectors(direction)[:, 0]) ** 2).sum(axis=-1)
     assert largest_gain_dbi(antenna) == pytest.approx(10 * np.log10(power.max()), abs=1e-9)
+
+
+def test_digests_name_files_relative_to_the_study(planted: Study, tmp_path: Path) -> None:
+    """Also those of antennas, unless a file is outside the study's folder; the current folder has no influence."""
+    folder, gain = planted.path.parent, "azimuth_deg,elevation_deg,gain_dbi\n"
+    content = mounted(planted).content()
+    for name, file in (("sector", folder / "inside.csv"), ("rod", tmp_path / "outside.csv")):
+        file.write_text(gain)
+        content["antennas"]["types"][name]["pattern"] = os.path.relpath(file, folder)
+    study = Study.from_content(content, planted.path)
+    scene = Setup.open(planted, tracer=TwoRay).scene
+    digests = input_digests(study, scene)
+    assert digests.keys() >= {"scene.xml", "inside.csv", str(tmp_path / "outside.csv")}
+    assert digests["inside.csv"] == hashlib.sha256(gain.encode()).hexdigest()
 
 
 def test_three_transmitters_with_their_own_antennas_and_powers_are_calibrated(planted: Study) -> None:

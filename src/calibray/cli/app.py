@@ -65,10 +65,10 @@ class Commands(TyperGroup):
             raise
         except OSError as error:
             file = "" if error.filename is None else f"{error.filename}: "
-            echo(
-                f"Error: {file}cannot be read or written ({error.strerror or error}); check permissions and disk space",
-                err=True,
-            )
+            fault = f"cannot be read or written ({error.strerror or error}); check permissions and disk space"
+            if isinstance(error, FileNotFoundError):
+                fault = "file not found; restore it, or correct its path"
+            echo(f"Error: {file}{fault}", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
             # The command itself reports what was kept. An error during the interruption is reported here.

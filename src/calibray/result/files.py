@@ -241,9 +241,11 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
     except ValidationError as error:
         refusal = explain(error, Stored, values, str(source))
         raise refusal from None
-    moved = source.parent / stored.study_from_here
-    is_moved = stored.study_from_here and not exists(stored.study_file) and exists(moved)
-    study = Study.from_content(stored.study, moved if is_moved else stored.study_file)
+    # A study that was moved or copied together with the result takes precedence, because its files are next to it.
+    near = Path(os.path.normpath(source.parent.resolve() / stored.study_from_here))
+    study = Study.from_content(
+        stored.study, near if stored.study_from_here and exists(near) else stored.study_file
+    )
     _check_consistent(stored, study, source)
     return stored, study
 

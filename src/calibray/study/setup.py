@@ -464,16 +464,25 @@ class Setup:
 
 
 def input_digests(study: StudyModel, scene: Scene) -> dict[str, str]:
-    """SHA-256 digests of the files of a study's scene, regions, facades, antennas and rays, by resolved path."""
+    """SHA-256 digests of the files of a study's scene, regions, facades, antennas and rays.
+
+    The keys are paths relative to the study, or absolute paths for files outside its folder.
+    """
     antennas = [*study.stated_antennas.values(), *study.antenna_types.values()]
     gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
-    digests = {str(scene.path): hashlib.sha256(scene_content(scene.path)).hexdigest()}
+    digests = {_from_study(study, scene.path): hashlib.sha256(scene_content(scene.path)).hexdigest()}
     rays = [] if study.rays_path is None else [study.rays_path]
     outlines = (*study.region_paths.values(), *study.facade_paths.values())
     regions = [file for file in outlines if file is not None]
     for file in (*cache.mesh_files(scene), *gains, *rays, *regions):
-        digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
+        digests[_from_study(study, file)] = hashlib.sha256(file.read_bytes()).hexdigest()
     return digests
+
+
+def _from_study(study: StudyModel, file: Path) -> str:
+    """The path of a file relative to the study, or its absolute path if it is outside the study's folder."""
+    file, folder = file.resolve(), study.path.parent.resolve()
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else str(file)
 
 
 def _scene_of(study: StudyModel, frequency: float) -> Scene:
