@@ -71,8 +71,8 @@ def test_received_power_is_predicted_in_the_measured_quantity(received):
     assert set(predictions.remark[~predictions.basis.str.startswith("no path")]) == {""}
 
 
-def test_links_far_weaker_than_every_measured_one_have_a_remark(received):
-    """Links near the noise floor do not count as measured; a remark on the position comes first."""
+def test_links_far_weaker_than_every_calibrated_one_have_a_remark(received):
+    """Links near the noise floor do not count as calibrated; a remark on the position comes first."""
     links = received.links
     weakest_db = float(links.measured_db.max())
     table = planted.links(blocked=True).assign(sent_dbm=30.0)
@@ -82,7 +82,7 @@ def test_links_far_weaker_than_every_measured_one_have_a_remark(received):
     weaker = loss_db > np.median(loss_db)
     weaker[planted.INSIDE] = False
     assert remarks[planted.INSIDE] == "receiver inside a building"
-    assert (remarks == "over 10 dB weaker than every measured link").tolist() == weaker.tolist()
+    assert (remarks == "over 10 dB weaker than every link used by the calibration").tolist() == weaker.tolist()
     assert 0 < weaker.sum() < len(weaker) - 1
     strong = lowered.assign(faint=lowered.measured_db < lowered.measured_db.max())
     weak = strong.assign(faint=~strong.faint)

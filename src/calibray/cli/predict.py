@@ -63,7 +63,7 @@ def predict(
             "P",
             "Add the interval that contains a measurement with this probability, such as 0.9, as the columns lower_db "
             "and upper_db. Also add a remark if an antenna is inside a building or outside the scene, or if the link "
-            "is far weaker than every measured link.",
+            "is far weaker than every link used by the calibration.",
         ),
     ] = None,
     *,

@@ -54,7 +54,7 @@ NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance explained by measured links above which a link counts as near them."""
 
 WEAKER_DB: Final = 10.0
-"""Excess over the largest measured path loss above which a prediction has a remark [dB]. In a synthetic town with wrong
+"""Excess over the largest calibrated path loss above which a prediction has a remark [dB]. In a synthetic town with wrong
 building heights, the errors of such predictions were up to 46 dB."""
 
 
@@ -524,12 +524,15 @@ def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.D
 
 
 def _weak(result: Record, path_loss_db: NDArray[np.float64]) -> list[str]:
-    """The remark on links far weaker than every measured link [links]; the model was never compared with such links."""
+    """The remark on links far weaker than every link used by the calibration [links].
+
+    The model was not fitted to such links. Measured links near the noise floor are not used, so they do not count.
+    """
     measured_db = result.links["measured_db"].to_numpy(float)
     if "faint" in result.links:
         measured_db = measured_db[~result.links["faint"].to_numpy(bool)]
     weak = path_loss_db > measured_db.max(initial=-np.inf) + WEAKER_DB
-    return np.where(weak, f"over {WEAKER_DB:g} dB weaker than every measured link", "").tolist()
+    return np.where(weak, f"over {WEAKER_DB:g} dB weaker than every link used by the calibration", "").tolist()
 
 
 def is_indoors(result: Record, triangles: Triangles) -> bool:
