@@ -227,6 +227,13 @@ def test_the_rate_of_the_calibration_gives_the_cost(
         "Tracing 1,000 cells: up to about 17 minutes at the rate of the 17 calibration links"
     )
     assert "without a trace" in said[1]
+    content = slow.study.content()
+    content["trace"]["samples"] = "auto"
+    announce(replace(slow, study=cb.Study.from_content(content, slow.study.path)), 1000, "cells")
+    assert said[2] == (
+        "Tracing 1,000 cells: about 17 minutes at the rate of the 17 calibration links, less if they are cached, much "
+        "longer if the calibration read its paths from the cache"
+    )
 
 
 def test_calibrated_links_and_known_candidates_are_not_traced_again(

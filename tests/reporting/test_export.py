@@ -116,6 +116,15 @@ def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_mat
     assert sampling_text(result) == ""
     unchecked = replace(result, fit=replace(result.fit, retrace_gap_db=None))
     assert "depends on the materials" in sampling_text(unchecked)
+    assert sampling_text(unchecked).endswith("load_scene.py prints the difference of every link.")
+    for section, stated in (
+        ("links", {"tx_antenna": {"azimuth_deg": 0.0}}),
+        ("antennas", {"tx": {"pattern": "sector.msi"}}),
+    ):
+        content = unchecked.study.content()
+        content[section] |= stated
+        other = replace(unchecked, study=cb.Study.from_content(content, result.study.path))
+        assert "load_scene.py prints no differences" in sampling_text(other)
 
 
 def test_a_scene_that_changed_since_the_calibration_is_not_exported_or_shown(folder, tmp_path):

@@ -171,17 +171,20 @@ def announce(result: Record, links: int, what: str = "links") -> None:
         )  # fmt: skip
         return
     calibrated, seconds = len(result.links), _seconds(result, links)
-    time = f"up to about {duration(seconds)}" if seconds >= 2 else "less than 2 seconds"
+    adaptive = result.study.trace.adaptive
+    most = f"{'' if adaptive else 'up to '}about {duration(seconds)}"
     LOG.info(
-        "Tracing %s: %s at the rate of the %s calibration links, less if they are cached",
-        counted, time, f"{calibrated:,}",
+        "Tracing %s: %s at the rate of the %s calibration links, less if they are cached%s",
+        counted, most if seconds >= 2 else "less than 2 seconds", f"{calibrated:,}",
+        ", much longer if the calibration read its paths from the cache" if adaptive else "",
     )  # fmt: skip
 
 
 def _seconds(result: Record, links: int) -> float:
     """Estimated duration of a trace [s].
 
-    The calibration may have read its trace from the cache, so an estimate from the number of rays is a lower limit.
+    The calibration may have read its trace from the cache, so an estimate from the number of rays is a lower limit. If
+    rays are added until path loss converges, their number is unknown.
     """
     settings = result.study.trace
     lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links

@@ -54,8 +54,8 @@ NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance explained by measured links above which a link counts as near them."""
 
 WEAKER_DB: Final = 10.0
-"""Excess over the largest calibrated path loss above which a prediction has a remark [dB]. In a synthetic town with wrong
-building heights, the errors of such predictions were up to 46 dB."""
+"""Excess over the largest calibrated path loss above which a prediction has a remark [dB]. In a synthetic town with
+wrong building heights, the errors of such predictions were up to 46 dB."""
 
 
 SAME_ANSWER_DB: Final = 0.01
@@ -532,7 +532,9 @@ def _weak(result: Record, path_loss_db: NDArray[np.float64]) -> list[str]:
     if "faint" in result.links:
         measured_db = measured_db[~result.links["faint"].to_numpy(bool)]
     weak = path_loss_db > measured_db.max(initial=-np.inf) + WEAKER_DB
-    return np.where(weak, f"over {WEAKER_DB:g} dB weaker than every link used by the calibration", "").tolist()
+    return np.where(
+        weak, f"over {WEAKER_DB:g} dB weaker than every link used by the calibration", ""
+    ).tolist()
 
 
 def is_indoors(result: Record, triangles: Triangles) -> bool:

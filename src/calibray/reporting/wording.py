@@ -154,7 +154,16 @@ def sampling_text(record: Record) -> str:
             "The traced set of refracted and diffuse paths depends on the materials. The reported path loss was "
             "computed on paths that may have been traced with materials other than those of the exported scene."
         )
-    return " ".join([*causes, "load_scene.py prints the difference of every link."]) if causes else ""
+    if not causes:
+        return ""
+    study = record.study
+    if study.links.mountings or any(each.gain_file or each.is_array for each in study.antenna_pair):
+        causes.append(
+            "load_scene.py prints no differences, because it cannot compute path loss with these antennas."
+        )
+    else:
+        causes.append("load_scene.py prints the difference of every link.")
+    return " ".join(causes)
 
 
 def held_out_text(record: Record) -> str:
