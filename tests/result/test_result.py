@@ -18,6 +18,7 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.errors import InputError
+from calibray.reporting.result_tables import nuisances
 from calibray.reporting.summary import summary
 from calibray.result.files import FILES
 from calibray.result.held_out import HeldOutErrors, Model
@@ -375,3 +376,15 @@ def test_a_report_of_an_edited_result_is_written_with_the_option_that_its_refusa
     refused = CliRunner().invoke(app, ["report", str(folder)])
     assert (refused.exit_code, "--allow-changed-inputs" in refused.output) == (2, True)
     assert CliRunner().invoke(app, ["report", str(folder), "--allow-changed-inputs"]).exit_code == 0
+
+
+def test_the_table_of_offsets_has_their_standard_deviations(result):
+    """Planted offsets are within three of them, and they exceed those of known materials: 0.3 dB over the root of n."""
+    table = nuisances(result)
+    assert table.headings == ("Offsets", "[dB]", "standard deviation [dB]")
+    assert [row[0] for row in table.rows] == sorted(OFFSETS)
+    for half, value, deviation in table.rows:
+        assert 0.3 / np.sqrt(6) < float(deviation) < 3.0
+        assert abs(float(value) - OFFSETS[half]) < 3 * float(deviation)
+    without = replace(result, uncertainty=replace(result.uncertainty, draws={}))
+    assert nuisances(without).headings == ("Offsets", "[dB]")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf, log
+from statistics import stdev
 from typing import Final
 
 from calibray.parameters.parameter import PARAMETER_BOUNDS
@@ -148,17 +149,31 @@ def remarks(result: Record) -> Table:
 
 
 def nuisances(result: Record) -> Table:
-    """Offsets and the coefficients of further nuisances, by group; no rows if the study declares no nuisance."""
-    nuisance = result.nuisance
-    others = _nuisances_besides_offset(result)
-    offsets = {group: f"{value:+z.2f}" for group, value in nuisance.offsets_db.items()}
-    offsets |= dict.fromkeys(nuisance.groups_without_path, "no link with a path")
-    rows = [(group_text(result, group) if group else "all links", text) for group, text in offsets.items()]
+    """Offsets and the coefficients of further nuisances, by group; no rows if the study declares no nuisance.
+
+    If the posterior draws contain them, a further column has their standard deviations.
+    """
+    nuisance, others = result.nuisance, _nuisances_besides_offset(result)
+
+    def spread(name: str, group: str) -> str:
+        drawn = result.uncertainty.draws.get(f"{name}[{group}]" if group else name, ())
+        return f"{stdev(drawn):.2g}" if len(drawn) > 1 else ""
+
+    rows = [
+        (group_text(result, group) if group else "all links", f"{value:+z.2f}", spread(OFFSET, group))
+        for group, value in nuisance.offsets_db.items()
+    ]
+    rows += [(group_text(result, group), "no link with a path", "") for group in nuisance.groups_without_path]
     for name, values in others.items():
-        rows += [(f"{name}, {group}" if group else name, f"{value:+.3g}") for group, value in values.items()]
+        rows += [
+            (f"{name}, {group}" if group else name, f"{value:+.3g}", spread(name, group))
+            for group, value in values.items()
+        ]
     # The column of an offset is 1; that of a further nuisance can be a length or a number of walls.
     title, unit = ("Nuisances", "dB per unit") if others else ("Offsets", "dB")
-    return Table(title, (Column(), numbers(unit=unit)), tuple(rows))
+    columns = (Column(), numbers(unit=unit), numbers("standard deviation", unit))
+    shown = columns if any(row[2] for row in rows) else columns[:2]
+    return Table(title, shown, tuple(row[: len(shown)] for row in rows))
 
 
 def accuracy(result: Record) -> Table:
