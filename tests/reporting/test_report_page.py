@@ -169,6 +169,8 @@ def test_the_headline_compares_the_prediction_model_with_its_rivals(result):
     # No "0 of them held out" next to a held-out RMSE.
     assert links[2] == (f"{len(block)} of them held out in turn, in 2 blocks",)
     assert dict(row[:2] for row in tables.links(judged).rows)["held out"] == str(len(block))
+    in_turn = replace(judged, links=judged.links.assign(held_out=False))
+    assert {row[-2] for row in reports._worst(in_turn, survey(in_turn)).rows} == {"in turn"}
 
 
 def test_links_are_shown_in_the_quantity_that_was_measured(result):
@@ -215,6 +217,7 @@ def test_embedded_data_equal_the_result(html, result):
     predicted = [np.inf if value is None else value for value in links["predicted"]]
     assert predicted == pytest.approx(table.predicted_db.tolist(), abs=0.0051)
     assert sum(links["held"]) == table.held_out.sum() > 0
+    assert links["held_out"] == ["yes" if held else "no" for held in table.held_out]
     words = " ".join(html.words.split())
     assert f"RMSE {result.holdout_rmse_db:.2f} dB" in words
     for name, value in result.parameters.items():

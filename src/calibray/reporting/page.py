@@ -305,14 +305,20 @@ def _worst(result: Record, links: Survey | None) -> Table:
     residuals = residual(result.links, quantity.sign)
     measured, predicted = (in_measured_quantity(result, name) for name in ("measured", "predicted"))
     order = np.argsort(-np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")[:WORST]
-    rows = []
+    rows, held_out = [], _held_out(result)
     for link in order[np.isfinite(residuals[order])]:
         row = result.links.iloc[int(link)]
         group = [str(links.group[link])] if links is not None and links.group is not None else []
         cells = (f"{measured[link]:.1f}", f"{predicted[link]:.1f}", f"{residuals[link]:+z.1f}")
-        marks = ("yes" if row[name] else "no" for name in ("held_out", "has_path"))
-        rows.append((str(row["row"]), *group, *cells, *marks))
+        rows.append((str(row["row"]), *group, *cells, held_out[link], "yes" if row["has_path"] else "no"))
     return Table("", columns, tuple(rows))
+
+
+def _held_out(result: Record) -> list[str]:
+    """Whether each link was held out: always, in turn, or never."""
+    blocks = np.zeros(len(result.links), bool) if result.held_out is None else result.held_out.block >= 0
+    always = result.links["held_out"].to_numpy(bool)
+    return np.select([always, blocks], ["yes", "in turn"], "no").tolist()
 
 
 def _commands(result: Record) -> str:
@@ -360,6 +366,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
                 for name in ("measured", "before", "predicted")
             },
             "held": links.table["held_out"].astype(int).tolist(),
+            "held_out": _held_out(result),
             "lost": (~links.has_path).astype(int).tolist(),
             "faint": links.faint.astype(int).tolist(),
             "color": ramp(residuals, ramp_limit(residuals)),

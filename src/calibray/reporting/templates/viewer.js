@@ -91,7 +91,7 @@
     const facts = [
       [`measured ${data.quantity.name}`, decibel(links.measured[i])], ["before calibration", decibel(links.before[i])],
       ["predicted", decibel(links.predicted[i])], ["predicted − measured", signed(residual[i])],
-      ["held out", links.held[i] ? "yes" : "no"], ["basis", links.lost[i] ? "no path" : "prediction model"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
+      ["held out", links.held_out[i]], ["basis", links.lost[i] ? "no path" : "prediction model"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
     ];
     const box = byId("facts");
     box.replaceChildren();
