@@ -1,6 +1,7 @@
 """A study with a region of extra loss, from its file to predictions."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,6 +13,8 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
+from calibray.reporting import link_map
+from calibray.reporting.page import collect, page
 from calibray.reporting.wording import scene_alone_text
 from calibray.scenes.authoring import Terrain, make_scene, read_openstreetmap, read_trees
 from calibray.scenes.checks import SceneSurfaces
@@ -78,6 +81,17 @@ def test_a_planted_attenuation_is_found_and_used_for_predictions(tmp_path, engin
     difference = result.links.after_db - result.links.scene_db
     assert difference.max() > 5.0
     assert "a scene cannot contain the region trees" in scene_alone_text(result)
+    # The map of the report has the outline of the trees.
+    data = collect(loaded)
+    layout = link_map.plan(data.links, data.triangles, data.regions.values())
+    html = page(loaded, data, {})
+    assert re.search(f'class="regions" d="{layout.regions}".*<i class="regions"></i>trees<', html, re.DOTALL)
+    corners = np.array([corner.split(",") for corner in layout.regions.strip("MZ").split("L")], dtype=float)
+    west, south, east, north = BOX
+    box = layout.project(np.array([[west, south], [east, north]]))
+    assert [*corners.min(axis=0), *corners.max(axis=0)] == pytest.approx(
+        [*box.min(axis=0), *box.max(axis=0)], abs=0.051
+    )
     fixed = planted.study(
         tmp_path,
         table,
@@ -103,7 +117,7 @@ def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine, co
     (effect,), (expected,) = other.effects(engine.paths), opened.effects(engine.paths)
     assert effect.length == pytest.approx(expected.length)
     assert effect.maximum_db == pytest.approx(1.15 * 3500**0.43)
-    assert str(tmp_path / "trees.geojson") in other.files
+    assert "trees.geojson" in other.files
 
 
 @pytest.mark.parametrize(

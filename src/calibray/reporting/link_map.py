@@ -16,8 +16,10 @@ from calibray.errors import InputError
 from calibray.reporting.link_survey import Survey
 from calibray.scenes import Triangles, read_meshes
 from calibray.scenes.buildings import footprints
+from calibray.scenes.obstruction import Region
 from calibray.scenes.triangles import LEVEL, STEEP, is_ground
 from calibray.support.figure_style import BLUE, FAINT, LINE, ORANGE, dress, styled
+from calibray.support.lazy_imports import library
 from calibray.support.messages import counted
 from calibray.support.output_files import check_file, replacing
 
@@ -56,6 +58,7 @@ class Plan:
         buildings: Outlines of buildings, as data of an SVG path.
         walls: Vertical faces seen from above, in the same form.
         bar: Length of the scale bar [m].
+        regions: Outlines of the study's regions, in the same form.
     """
 
     height: int
@@ -65,6 +68,7 @@ class Plan:
     buildings: str
     bar: float
     walls: str = ""
+    regions: str = ""
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert positions [n, 2 or 3], [m], to map units measured from the upper left corner [n, 2]."""
@@ -73,9 +77,10 @@ class Plan:
         )
 
 
-def plan(survey: Survey, triangles: Triangles | None) -> Plan:
-    """Lay out the map of a calibration's links, over the scene if it can be read."""
-    return lay_out(np.concatenate([survey.tx, survey.rx]), triangles)
+def plan(survey: Survey, triangles: Triangles | None, regions: Iterable[Region] = ()) -> Plan:
+    """Lay out the map of a calibration's links, over the scene if it can be read, and over regions such as trees."""
+    layout = lay_out(np.concatenate([survey.tx, survey.rx]), triangles)
+    return replace(layout, regions="".join(_outlines(region, layout) for region in regions))
 
 
 def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
@@ -166,6 +171,14 @@ def _buildings(triangles: Triangles, layout: Plan) -> str:
         line = layout.project(loop).round(1)
         outlines.setdefault(frozenset(map(tuple, line.tolist())), line.tolist())
     return "".join(f"M{'L'.join(f'{x:g},{y:g}' for x, y in line)}Z" for line in outlines.values())
+
+
+def _outlines(region: Region, layout: Plan) -> str:
+    """Outline of the union of a region's polygons, simplified to one map unit."""
+    shapely = library("shapely", "scenes")
+    parts = shapely.get_parts(shapely.simplify(shapely.union_all(region.outline), 1 / layout.scale))
+    lines = [layout.project(shapely.get_coordinates(ring)).round(1) for ring in shapely.get_rings(parts)]
+    return "".join(f"M{'L'.join(f'{x:g},{y:g}' for x, y in line.tolist())}Z" for line in lines)
 
 
 def _walls(triangles: Triangles, layout: Plan) -> str:

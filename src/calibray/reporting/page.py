@@ -10,7 +10,7 @@ import json
 import math
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import date
 from hashlib import sha256
 from importlib.resources import files
@@ -35,6 +35,8 @@ from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
+from calibray.scenes.obstruction import Region
+from calibray.study.row_steps import study_regions
 from calibray.support import figure_style as style
 from calibray.support.messages import command
 from calibray.support.output_files import check_file, check_outputs, write_text
@@ -87,6 +89,7 @@ class PageData:
         triangles: Meshes of the scene.
         rays: Paths of the links; None if these are not available.
         missing: Items that are not shown, with the reasons.
+        regions: Regions of the study, by name.
     """
 
     links: Survey | None
@@ -94,6 +97,7 @@ class PageData:
     triangles: Triangles | None = None
     rays: Rays | None = None
     missing: tuple[str, ...] = ()
+    regions: Mapping[str, Region] = field(default_factory=dict)
 
 
 def report(
@@ -155,6 +159,11 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
         except InputError as error:
             missing.append(f"Scene: {error}.")
     triangles = None if scene is None else read_triangles(scene)
+    regions = {}
+    try:
+        regions = study_regions(study)
+    except InputError as error:
+        missing.append(f"Regions: {error}.")
     drawn = None
     if study.engine.external and result.paths is None:
         reason = "are not in the ledger" if study.engine.exports_rays else "are not part of its answers"
@@ -167,7 +176,7 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
         if drawn is not None and drawn.paths.num_links != len(result.links):
             drawn = None
             missing.append("Paths: the links of the study have changed since the calibration.")
-    return PageData(links, scene, triangles, drawn, tuple(missing))
+    return PageData(links, scene, triangles, drawn, tuple(missing), regions)
 
 
 def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
@@ -181,7 +190,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
     )
     environment.filters["breakable"] = _breakable
     script = _asset("viewer.js")
-    layout = None if data.links is None else plan(data.links, data.triangles)
+    layout = None if data.links is None else plan(data.links, data.triangles, data.regions.values())
     return environment.get_template("report.html.jinja").render(
         name=_title(result.study.path),
         heading=tables.heading(result),
@@ -200,6 +209,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         captions=CAPTIONS,
         worst=_worst(result, data.links),
         map=layout,
+        regions=", ".join(data.regions),
         marks=None if data.links is None or layout is None else marks(data.links, layout),
         rays=data.rays,
         missing=data.missing,
