@@ -137,6 +137,7 @@ def test_a_group_with_only_faint_links_keeps_all_of_them_with_a_warning(caplog):
     (message,) = caplog.messages
     assert f"{weak.sum()} of {len(way)} links are expected near the noise floor" in message
     assert "do not determine offset[weak]" in message
+    assert "weak links are received only if fading is favourable" in message
 
 
 @pytest.mark.parametrize(

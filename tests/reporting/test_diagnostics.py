@@ -126,6 +126,10 @@ def test_a_mean_over_few_links_has_a_bar_of_two_standard_errors_and_one_link_has
 
 def test_tables_without_data_are_left_out():
     result = shown.result()
+    for share, overlap in ((0.59, True), (0.3, False)):
+        stated = changed(result, power_shares={"walls": {"specular": share}, "line of sight": {"": 0.5}})
+        text = dict(diagnostics_table(stated).rows)["power"]
+        assert ("; shares overlap, because a path counts for each of its interactions" in text) == overlap
     bare = changed(result, draws={}, intervals={}, power_shares={})
     assert "trade_offs" not in bare.diagnostics
     assert "power" not in bare.diagnostics

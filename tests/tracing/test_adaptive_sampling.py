@@ -18,7 +18,7 @@ from calibray.reporting import scene_tables as report
 from calibray.scenes import read_scene
 from calibray.tracing import convergence
 from calibray.tracing.settings import Antenna, TraceSettings
-from calibray.tracing.sionna import Tracer
+from calibray.tracing.sionna import Tracer, adaptive_sampling
 from calibray.tracing.sionna.image_method import Edges, Surfaces, unfold
 from small_scenes import write_scene
 
@@ -122,6 +122,19 @@ def test_reversed_links_have_the_same_path_loss(yard: Tracer, rounds: Paths) -> 
         for samples in ("auto", 100_000)
     )
     np.testing.assert_allclose(path_loss(there), path_loss(back), atol=1e-5)
+
+
+def test_a_search_that_ends_at_the_limit_of_rays_names_the_position_and_the_remedy(
+    yard: Tracer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(adaptive_sampling, "MAX_LAUNCHES", 1)
+    links = SimpleNamespace(tx=LINKS.tx[:1] + 0.00042, rx=LINKS.rx[:1])
+    yard.trace(links)
+    assert re.search(
+        r"The last of 250,000 rays from position \(-20\.0, 2\.0, 12\.0\) m still changed path loss by up to "
+        r"\d\.\d\d dB, more than the tolerance of 0\.05 dB, so paths may be missing; reduce trace\.max_depth",
+        caplog.text,
+    )
 
 
 def test_a_trace_without_interactions_sends_no_rays(yard: Tracer) -> None:

@@ -132,7 +132,7 @@ def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_
     names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
     _LOG.warning(
         "%s: %s of %s links are expected near the noise floor, but are kept because the others do not determine %s; "
-        "weak links are received only if their errors are favourable, so the fitted offsets and path loss are too low; "
+        "weak links are received only if fading is favourable, so the fitted offsets and path loss are too low; "
         "measure at shorter distances",
         problem.setup.links.source, f"{faint.sum():,}", f"{problem.objective.num_counted:,}",
         names or "all unknowns",

@@ -221,7 +221,12 @@ def _power_text(table: pd.DataFrame) -> str:
         f"{row['material']} {row['interaction']} {percent(float(row['share']))}".replace("  ", " ")
         for row in rows
     )
-    return f"mean share of a link's power: {', '.join(shares)}"
+    overlap = (
+        "; shares overlap, because a path counts for each of its interactions"
+        if table["share"].sum() > 1
+        else ""
+    )
+    return f"mean share of a link's power: {', '.join(shares)}{overlap}"
 
 
 def _distance_text(result: Record) -> str:

@@ -99,7 +99,9 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
         f"{'below' if values['side'] == 'lower' else 'above'} {values['value']:.4g}, with a probability of 90 %"
     ),
     ReasonKind.NO_EFFECT: lambda values, _: (
-        f"no link's path loss changes by more than {values['change_db']:.1f} dB over the whole range"
+        f"no link's path loss changes by more than {max(values['change_db'], 0.1):.1f} dB over the whole range"
+        if values["change_db"]
+        else "no link's path loss depends on it"
     ),
     ReasonKind.TRADE_OFF: lambda values, _: (
         f"it trades off with {values['parameter']} (rank correlation {values['correlation']:.2f})"

@@ -206,9 +206,11 @@ class _SourceSearch:
             quiet = quiet + 1 if self.change_db <= CONVERGED_DB else 0
         # The launch limit may also be reached after one quiet round; then no warning is needed.
         if quiet < QUIET_ROUNDS and self.change_db > CONVERGED_DB:
+            x, y, z = self._launch.source.tolist()
             _LOG.warning(
-                "%s rays from %s still changed path loss by up to %.2f dB: paths may be missing",
-                f"{self.rays:,}", self._launch.source.tolist(), self.change_db,
+                "The last of %s rays from position (%.1f, %.1f, %.1f) m still changed path loss by up to %.2f dB, more "
+                "than the tolerance of %g dB, so paths may be missing; reduce trace.max_depth if such changes matter",
+                f"{self.rays:,}", x, y, z, self.change_db, CONVERGED_DB,
             )  # fmt: skip
 
     def _direct_paths(self) -> TracedBuffer:
