@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -157,6 +158,16 @@ class Answers:
 def test_what_an_engine_returns(study: cb.Study, change: Callable[[np.ndarray], Any], message: str) -> None:
     with pytest.raises(EngineError, match=message):
         cb.calibrate(study.replace(method="gwo"), engine=Answers(study, change))
+
+
+def test_what_is_no_result(study: cb.Study, tmp_path: Path) -> None:
+    for call in (
+        lambda: cb.coverage_map(study, [0, 0, 10]),
+        lambda: cb.suggest(study, LINKS),
+        lambda: cb.report(study, tmp_path / "a.html"),
+    ):
+        refused(r"result: is a .*Study, must be a Result; read one with Result\.load", call)
+    refused("study: is an? int, must be a Study", lambda: engines.make(5))
 
 
 def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Paths) -> None:

@@ -150,3 +150,19 @@ def test_the_scene_is_traced_with_the_starts_unless_told_otherwise(tmp_path):
     calibrated = setup.scene.materials | {"marble": setup.scene.materials["wood"]}
     assert setup.trace(calibrated).materials["marble"].scattering_coefficient == 0.0
     assert setup.trace().materials == setup.scene.materials
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.inf, "a value is not finite"),
+        (2 + 1j, "complex128, must be real"),
+    ],
+)
+def test_candidates_that_are_no_real_numbers_are_refused(value, message):
+    candidate = np.full((1, 3), 2.0, dtype=complex if isinstance(value, complex) else float)
+    candidate[0, 1] = value
+    with pytest.raises(InputError, match=message):
+        planted.engine().path_loss(candidate)
+    with pytest.raises(InputError, match="must be real numbers"):
+        planted.engine().path_loss([["a", "b", "c"]])

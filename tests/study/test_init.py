@@ -114,7 +114,7 @@ def test_values_that_the_receiver_clips_become_its_noise_floor(scene, tmp_path):
         below = int((rsrp == floor).sum()) if expected else 0
         assert found.study.measurements().prepared.get("at or below the noise floor, left out", 0) == below
         reasons = {each.what: each.reason for each in found.assumptions}
-        stated = f"{below / 300:.0%} of the values equal the lowest one" if expected else None
+        stated = f"{100 * below / 300:.0f} % of the values equal the lowest one" if expected else None
         assert reasons.get("links.noise_floor_dbm") == stated
 
 
@@ -168,7 +168,7 @@ def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_pa
     losses = drafted.study.measurements().path_loss_db
     assert sorted(losses) == sorted(-power[(power > -82.0) & (power < -68.0)])
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
-    share = f"{(power == -68.0).mean():.0%}"
+    share = f"{100 * (power == -68.0).mean():.0f} %"
     assert reasons["links.where"] == f"{share} of the values equal the highest one: the receiver is saturated"
 
 

@@ -20,6 +20,7 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.scenes import Scene
+from calibray.support.messages import type_name
 from calibray.support.progress import Progress
 from calibray.tracing.cache import mesh_files
 
@@ -52,6 +53,10 @@ def make(
             used; or the study's scene, links or parameters cannot be used.
     """
     check_workers(workers)
+    if not hasattr(study, "opened"):
+        raise InputError(
+            f"study: is a {type_name(study)}, must be a Study; read a file with Study.load(file)"
+        )
     opened = study.opened()
     name = opened.engine.name if name is None else name
     if name not in KINDS:

@@ -41,7 +41,7 @@ class Engine(Protocol):
         """Path loss [n, L], [dB], for candidates [n, d] in the parameters' units; +inf for a link without a path.
 
         Raises:
-            InputError: The candidates have the wrong width, or a value is infinite, NaN or unphysical.
+            InputError: The candidates have the wrong width, or a value is not a finite real number.
         """
         ...
 
@@ -66,7 +66,7 @@ class Differentiable(Engine, Protocol):
         """Path loss [n, L], [dB], and its derivatives with respect to the parameters [n, L, d], [dB] per unit.
 
         Raises:
-            InputError: The candidates have the wrong width, or a value is infinite, NaN or unphysical.
+            InputError: The candidates have the wrong width, or a value is not a finite real number.
         """
         ...
 
@@ -124,7 +124,7 @@ class Observing(Engine, Protocol):
         """Path loss and the statistics `wanted` of every link for candidates [n, d]; each candidate is one RT call.
 
         Raises:
-            InputError: The candidates have the wrong width, or a value is infinite, NaN or unphysical.
+            InputError: The candidates have the wrong width, or a value is not a finite real number.
         """
         ...
 
@@ -272,11 +272,14 @@ def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.
     """Convert candidates [n, d] to an array, and refuse candidates that cannot be evaluated.
 
     Raises:
-        InputError: The shape is wrong, or a value is not finite.
+        InputError: The shape is wrong, or a value is not a finite real number.
     """
-    values = np.asarray(candidates, dtype=float)
+    values = np.asarray(candidates)
+    if values.dtype.kind not in "fiu":
+        raise InputError(f"candidates: values of type {values.dtype}, must be real numbers")
     if values.ndim != 2 or values.shape[1] != width or not len(values):
         raise InputError(f"candidates: shape {values.shape}, must be (n, {width}) with n at least 1")
+    values = values.astype(float, copy=False)
     if not np.isfinite(values).all():
         raise InputError("candidates: a value is not finite; give numbers within the bounds")
     return values

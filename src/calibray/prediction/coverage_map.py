@@ -28,7 +28,7 @@ from calibray.prediction.map_files import CoverageMap
 from calibray.prediction.observables import observable_columns
 from calibray.prediction.predict import as_links, is_indoors, open_for_links
 from calibray.result.held_out import NEW_GROUP, NO_PATH
-from calibray.result.record import Record
+from calibray.result.record import Record, check_record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.scenes.checks.positions import INSIDE, locate
 from calibray.scenes.obstruction import CLUSTER
@@ -85,6 +85,7 @@ def coverage_map(
             `Result.predict_interval` refuses the links.
         EngineError: The paths do not fit into memory.
     """
+    check_record(result)
     check_workers(workers)
     if samples is not None:
         if isinstance(samples, bool) or not (

@@ -43,7 +43,7 @@ from calibray.prediction.predict import (
     with_constants,
 )
 from calibray.result.files import has_links
-from calibray.result.record import Record
+from calibray.result.record import Record, check_record
 from calibray.scenes import read_triangles
 from calibray.study import Setup
 from calibray.study.calibration_sections import OFFSET
@@ -102,6 +102,7 @@ def suggest(
         InputError: `Result.predict` would refuse the input for a reason other than unknown groups; the calibration has
             no draws; or no candidate has a path and a predicted power far enough above the study's noise floor.
     """
+    check_record(result)
     if isinstance(count, bool) or not (isinstance(count, Integral) and count >= 1):
         raise InputError(f"count = {count!r}: must be a whole number of at least 1")
     study = result.study

@@ -32,7 +32,7 @@ from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
 from calibray.reporting.wording import carriers_text, diagnostics_table, group_text, held_out_text
 from calibray.result.held_out import Model
-from calibray.result.record import Record
+from calibray.result.record import Record, check_record
 from calibray.result.verdict import Verdict
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.scenes.obstruction import Region
@@ -121,6 +121,7 @@ def report(
     Raises:
         InputError: The file or the folder cannot be written, or a file in it must not be replaced.
     """
+    check_record(result)
     inputs = result.study.files()
     target = check_file(file, inputs, overwrite)
     folder = None if figures is None else check_outputs(figures, PICTURES, inputs, overwrite)

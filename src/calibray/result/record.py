@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements.placement import ends_of
 from calibray.paths import Paths
@@ -23,6 +24,7 @@ from calibray.result.held_out import (
 from calibray.result.verdict import Interval, Remark
 from calibray.scenes import Scene
 from calibray.study import Study
+from calibray.support.messages import type_name
 from calibray.tracing.protocol import EnclosedAntennas
 
 # When `files` reads the sections, Pydantic validates them, including these bounds of numbers.
@@ -335,3 +337,15 @@ class Record:
             "rows_with_enclosed_tx": None if enclosed is None else list(enclosed.tx),
             "rows_with_enclosed_rx": None if enclosed is None else list(enclosed.rx),
         }
+
+
+def check_record(result: object) -> None:
+    """Refuse anything but a result.
+
+    Raises:
+        InputError: It is something else, such as a study.
+    """
+    if not isinstance(result, Record):
+        raise InputError(
+            f"result: is a {type_name(result)}, must be a Result; read one with Result.load(folder)"
+        )

@@ -158,7 +158,7 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
     floor, reason, share = -np.inf, "", _share_at_lowest(column)
     some_missing = share == 0 and "wide" not in draft.section and column.isna().any()
     if share > 0:
-        floor, reason = float(column.min()), f"{share:.0%} of the values equal the lowest one"
+        floor, reason = float(column.min()), f"{100 * share:.0f} % of the values equal the lowest one"
     elif some_missing:
         floor, reason = float(np.floor(column.min())), f"{missing}, and none is lower"
     # With a floor below that of the least sensitive device, powers that this device misses would count as too weak.
@@ -169,7 +169,9 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
             lowest, which = float(values.min()), f"{name} {shortened(str(device))}"
             if (share := _share_at_lowest(values)) and lowest > floor:
                 floor = lowest
-                reason = f"{share:.0%} of the values of {which}, the least sensitive, equal its lowest one"
+                reason = (
+                    f"{100 * share:.0f} % of the values of {which}, the least sensitive, equal its lowest one"
+                )
             elif some_missing and values.isna().mean() > MISSING_SHARE and np.floor(lowest) > floor:
                 floor = float(np.floor(lowest))
                 reason = f"{missing}, and none of {which}, the least sensitive, is lower"
@@ -185,7 +187,7 @@ def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Serie
     if share > 0:
         name, highest = value.column, float(column.max())
         draft.add_filter(f"(`{name}` < {highest} or `{name}`.isna())")
-        reason = f"{share:.0%} of the values equal the highest one: the receiver is saturated"
+        reason = f"{100 * share:.0f} % of the values equal the highest one: the receiver is saturated"
         draft.assume("links.where", draft.section["where"], reason)
 
 

@@ -156,7 +156,8 @@ def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str,
     largest = CELL_SHARE * float(np.min(overhead.bounds[3:5] - overhead.bounds[:2]))
     if average.size > 2 * largest:
         yield (
-            f"averages span {average.size:g} m, {average.size / largest * CELL_SHARE:.0%} of the scene's shorter side",
+            f"averages span {average.size:g} m, {100 * average.size / largest * CELL_SHARE:.0f} % of the scene's "
+            "shorter side",
             f"set links.average.size to {largest:.2g} m or less",
         )
 
@@ -433,8 +434,8 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
         # A lossless antenna has a mean gain of 1, so its largest gain is above 0 dBi.
         if table.gain_dbi.max() == 0 and table.efficiency < LOSSY:
             yield (
-                f"the largest gain in {file} is 0 dBi and the mean gain is {table.efficiency:.0%}, which suggests "
-                "gains relative to the main direction",
+                f"the largest gain in {file} is 0 dBi and the mean gain is {100 * table.efficiency:.0f} %, which "
+                "suggests gains relative to the main direction",
                 "give absolute gains [dBi]",
             )
     if study.links.tx_antenna is not None and study.links.tx_antenna.aim is None:
