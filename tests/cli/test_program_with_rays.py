@@ -15,8 +15,8 @@ from calibray.calibration.result import Result
 from calibray.engines.rays.export import Exporting
 from calibray.errors import EngineError, InputError
 from calibray.fitting import ray_fit
-from calibray.reporting.ledger_paths import with_stored_paths
 from calibray.reporting.page import collect
+from calibray.reporting.viewer import with_stored_paths
 from calibray.result.held_out import Model
 from calibray.study.toml_file import study_text
 from commands import run

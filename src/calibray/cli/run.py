@@ -310,9 +310,9 @@ def report(
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.engines.ledger.ledger import LEDGER_FILE
-        from calibray.reporting.ledger_paths import with_stored_paths
         from calibray.reporting.page import FIGURES, FILE
         from calibray.reporting.page import report as write_report
+        from calibray.reporting.viewer import with_stored_paths
 
         result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         file = write_report(
