@@ -47,8 +47,8 @@ from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_int
 LARGEST_ERROR: Final = 0.5
 """Largest error of the emulator at left-out calls, relative to the RMSE of the best call, for which intervals are
 drawn. With larger errors, candidates near a call fit better only because the emulator is exact there. Without this
-limit, the sets contained 10 of 20 values called identified or weakly identified (15 runs with 2 to 16 calls per
-parameter), and with smaller errors 18 of 25 (14 runs)."""
+limit, the sets contained 2 of 7 values called identified or weakly identified with 2 calls per parameter, and 14 of 14
+with 8 or 16 (docs/measurements/intervals.md)."""
 
 NEGLIGIBLE_DB: Final = 0.05
 """Error of an emulator that is always accepted [dB]; path loss is not measured more precisely."""
