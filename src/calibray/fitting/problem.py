@@ -179,21 +179,25 @@ class Problem:
 
     def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
         """Like `evaluate`, but for candidates in the fields' units [n, d], without rounding errors of a conversion."""
-        parameters, objective, jacobian = self.parameters, self.objective, None
         with_slopes = derivatives and self.differentiable
         answer = self.respond(candidates, with_slopes)
-        modelled, observed = answer.path_loss, answer.observed
+        evaluation = self.judge(candidates, answer)
         if with_slopes and answer.loss_slope is not None:
             # Chain rule: from the fields' units to the search coordinates.
-            unit = parameters.search_slope(candidates)
+            unit = self.parameters.search_slope(candidates)
             further = (
                 None if answer.observed_slope is None else answer.observed_slope * unit[:, None, None, :]
             )
-            jacobian = self.slopes(candidates, modelled, answer.loss_slope * unit[:, None, :], further)
-        residuals = self.residuals(candidates, modelled, observed)
-        rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
+            slope = answer.loss_slope * unit[:, None, :]
+            return evaluation._replace(jacobian=self.slopes(candidates, answer.path_loss, slope, further))
+        return evaluation
+
+    def judge(self, candidates: NDArray[np.float64], answer: Responses) -> Evaluation:
+        """The evaluation, without derivatives, of candidates in the fields' units [n, d] from the engine's response."""
+        residuals = self.residuals(candidates, answer.path_loss, answer.observed)
+        rmse_db = np.sqrt(np.mean(residuals[:, : self.objective.num_counted] ** 2, axis=1))
         value = np.sqrt(np.mean(residuals**2, axis=1))
-        return Evaluation(value, residuals, jacobian, modelled, rmse_db, observed=observed)
+        return Evaluation(value, residuals, None, answer.path_loss, rmse_db, observed=answer.observed)
 
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
         """The engine's response to candidates in the fields' units [n, d]: the links' values and further observables.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray import optimizers
 from calibray.engines.ledger.recorded import Recorded
-from calibray.engines.protocol import Differentiable, Engine
+from calibray.engines.protocol import Differentiable, Engine, Responses
 from calibray.errors import InputError
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.optimizers import METHODS, LeastSquares, Optimizer
@@ -190,11 +190,15 @@ class Trail:
         self.rmse_db += evaluation.rmse_db.tolist()
         self.iteration += [iteration] * len(evaluation.value)
         self.seconds += [seconds] * len(evaluation.value)
-        for row, value in enumerate(evaluation.value.tolist()):
-            if value < self.best_value:
-                self.best, self.best_modelled = candidates[row], evaluation.modelled[row]
-                self.best_value, self.best_rmse_db = value, float(evaluation.rmse_db[row])
+        for row in range(len(candidates)):
+            self.compare(candidates, evaluation, row)
             self.best_db.append(self.best_rmse_db)
+
+    def compare(self, candidates: NDArray[np.float64], evaluation: Evaluation, row: int) -> None:
+        """Make one of the candidates in the fields' units [n, d] the best one if its objective is lower."""
+        if (value := float(evaluation.value[row])) < self.best_value:
+            self.best, self.best_modelled = candidates[row], evaluation.modelled[row]
+            self.best_value, self.best_rmse_db = value, float(evaluation.rmse_db[row])
 
     def history(self) -> pd.DataFrame:
         """One row per RT call: number, iteration, RMSE, best RMSE so far, seconds since the start."""
@@ -235,7 +239,10 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
     if not (problem.differentiable or problem.observed):
-        _compare_start(problem, trail)
+        # The engine was called for the initial values before the search.
+        start = problem.parameters.start[None]
+        answer = Responses(problem.before[None], np.zeros((1, 0, problem.num_links)))
+        trail.compare(start, problem.judge(start, answer), 0)
     if not np.isfinite(trail.best_rmse_db):
         raise InputError(
             "every candidate loses the path of at least one link; exclude such links or use no_path = 'censor'"
@@ -244,16 +251,6 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     if not len(trail.best_modelled):
         trail.best_modelled = problem.modelled(optimizer.best.x[None])[0]
     return trail
-
-
-def _compare_start(problem: Problem, trail: Trail) -> None:
-    """Make the initial values the best candidate if they fit better; they were called before the search."""
-    start, modelled = problem.parameters.start, problem.before
-    residuals = problem.residuals(start[None], modelled[None])[0]
-    value = float(np.sqrt(np.mean(residuals**2)))
-    if value < trail.best_value:
-        trail.best, trail.best_modelled, trail.best_value = start, modelled, value
-        trail.best_rmse_db = float(np.sqrt(np.mean(residuals[: problem.objective.num_counted] ** 2)))
 
 
 def _hits(engine: Engine) -> int:

@@ -60,10 +60,7 @@ def ensure_interruption() -> Iterator[None]:
         KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that followed, if any.
         Exception: The block raised this exception, and Ctrl-C was not pressed.
     """
-    handled = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
+    handled = _has_handler(signal.SIGINT, signal.default_int_handler)
     if handled:
         _pressed.clear()
         signal.signal(signal.SIGINT, _press)
@@ -93,6 +90,11 @@ def raise_pending_interruption() -> None:
 _pressed: list[float] = []
 
 
+def _has_handler(number: signal.Signals, handler: object) -> bool:
+    """Whether this is the main thread, which alone can set handlers, and a signal has this handler."""
+    return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is handler
+
+
 def _press(_: int, __: FrameType | None) -> None:
     _pressed.append(time.monotonic())
     raise KeyboardInterrupt
@@ -108,10 +110,7 @@ def interrupt_on_termination() -> Iterator[None]:
     Raises:
         KeyboardInterrupt: The process received SIGTERM; `exit_status` then returns `TERMINATED`.
     """
-    handled = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    )
+    handled = _has_handler(signal.SIGTERM, signal.SIG_DFL)
     if handled:
         _terminated.clear()
         signal.signal(signal.SIGTERM, _terminate)
