@@ -94,15 +94,17 @@ def test_only_scattering_that_a_scene_states_is_stated_by_its_study(
 def test_what_sections_do_not_state_remains_that_of_the_scene(measured: np.ndarray, tmp_path: Path) -> None:
     scene = street()
     scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
-    concrete = scene.radio_materials["concrete"]
-    concrete.scattering_pattern = rt.BackscatteringPattern(alpha_r=20, alpha_i=10, lambda_=0.5)
+    for name in ("concrete", "glass"):
+        pattern = rt.BackscatteringPattern(alpha_r=20, alpha_i=10, lambda_=0.5)
+        scene.radio_materials[name].scattering_pattern = pattern
     study = cb.Study.from_sionna(
         scene, measured, tmp_path,
         materials={"glass": {"thickness": 0.1}, "marble": {"itu": "wood"}}, antennas={"rx": {"pattern": "dipole"}},
     )  # fmt: skip
     materials = study.opened().scene.materials
-    assert materials["concrete"].scattering_pattern == "backscattering"
-    assert materials["concrete"].alpha_i == 10
+    for name in ("concrete", "glass"):
+        assert materials[name].scattering_pattern == "backscattering"
+        assert materials[name].alpha_i == 10
     assert materials["glass"].thickness == 0.1
     glass = np.array(scene.radio_materials["glass"].relative_permittivity).item()
     assert materials["glass"].relative_permittivity == pytest.approx(glass, rel=1e-6)
