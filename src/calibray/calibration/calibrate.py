@@ -158,7 +158,7 @@ def calibrate(
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
-    # A wrong direction looks like a loss on one side of a transmitter.
+    # A wrong direction looks like a loss on one side of a transmitter, so regions are tested last.
     on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)
     on_links += groups_remark(problem, trail)
     run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)

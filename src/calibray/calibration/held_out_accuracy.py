@@ -147,7 +147,7 @@ def _choice(
         return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
     rms_db, errors_db = None, objective.model(trail.best_modelled[None])[0] - objective.measured
     if problem.freedom >= 1:
-        # A new link has no weight, so these links count equally, as held-out ones do.
+        # A new link has no weight, so these links count equally, as held-out links do.
         rms_db = float(np.sqrt(np.sum(errors_db[objective.weight > 0] ** 2) / problem.freedom))
     basis = f"errors of {objective.num_counted} calibration links"
     return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(round(problem.freedom), 1), np.zeros(0))
@@ -197,12 +197,12 @@ def on_blocks(
 
 
 def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int64]) -> float:
-    """RMS spread [dB], over given links [n], of the random effects of groups that occur in only one block [L]."""
+    """RMS over `links` [n] of the spread [dB] of random effects, for groups that occur in only one `block` [L]."""
     return float(np.sqrt(np.mean(problem.objective.nuisance.new_group_spread(block)[links] ** 2)))
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """Ratio of the errors of links out of sight to those of all links; 1 if a nuisance models the difference."""
+    """Ratio of the errors of links out of sight to those of all links; 1 if unknown or modelled by a nuisance."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
@@ -219,10 +219,10 @@ def fit_fallback(
 ) -> PredictionModel:
     """Fit the fallback, the log-distance model, to the calibration links.
 
-    The errors of the fallback come from links without a path. If these are too few, they come from links out of sight,
-    some of which are near the noise floor, like links without a path. If these are also too few, the residuals on
-    held-out links [n], [dB], are used, which `basis` describes. Without enough held-out links, the residuals on the
-    calibration links are used.
+    The errors of the fallback come from links without a path. If there are too few, they come from links out of sight,
+    some of which are near the noise floor, like links without a path. If there are too few of these as well, the
+    residuals on held-out links [n], [dB], are used, which `basis` describes. Without enough held-out links, the
+    residuals on the calibration links are used.
     """
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))
@@ -246,7 +246,7 @@ def fit_fallback(
     else:
         counted = objective.weight > 0
         count, unknowns = int(counted.sum()), int(objective.determined.sum())
-        # In-sample errors are too small, because unknowns were fitted to them.
+        # In-sample errors are too small, because the unknowns were fitted to the same links.
         inflation = np.sqrt(count / (count - unknowns)) if count > unknowns else np.nan
         errors = residuals[counted] * inflation
         errors, basis = errors[np.isfinite(errors)], f"errors of {count} calibration links"

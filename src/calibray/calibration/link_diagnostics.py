@@ -1,8 +1,8 @@
 """Diagnostics of the links of a finished calibration.
 
 The diagnostics are the leverage and depth of links, power by material and interaction, and tracer settings that find
-paths for links without one. Possible explanations of the residuals are a missing region, groups of links, and other
-antenna directions.
+paths for links without one. Tests show whether a missing region, groups of links or other antenna directions explain
+the residuals.
 """
 
 from __future__ import annotations
@@ -53,9 +53,8 @@ class LinkDiagnostics:
     Attributes:
         columns: Columns for the table of links: `leverage` (NaN for a link of weight 0) and `depth`, the number of
             interactions of the strongest path (NaN for a link without a path).
-        power_shares: Share of the power carried by paths with an interaction, averaged over the links, by material and
-            kind of interaction. A path counts in full for each of its interactions, so the sum of the shares can exceed
-            1.
+        power_shares: Share of a link's power on paths with a given material and kind of interaction, averaged over the
+            links. A path counts in full for every such pair on it, so the sum of the shares can exceed 1.
     """
 
     columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -63,7 +62,7 @@ class LinkDiagnostics:
 
 
 def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> LinkDiagnostics:
-    """Compute diagnostics of the links at calibrated values [d], without columns that the engine cannot provide.
+    """Compute diagnostics of the links at calibrated values [d]; columns that the engine cannot provide are omitted.
 
     `paths` are the calibration's paths at the study's carrier, if available.
     """
@@ -183,8 +182,8 @@ FEWEST_CLUSTERS: Final = 8
 """Smallest number of clusters that contain links both inside and outside a group."""
 
 MIXED: Final = 0.5
-"""Smallest share of the variance of membership that lies within clusters; with a smaller share, the group is a
-location."""
+"""Smallest share of the variance of membership within clusters for which a group is tested; with a smaller share, the
+group is a location."""
 
 SIGNIFICANCE: Final = 0.01
 """Probability of a false remark about any group of any column, or about any antenna direction."""
@@ -230,7 +229,7 @@ def differing_groups(
         columns: Labels [n] by column.
     """
     count = min(max(len(ends) // CLUSTER_LINKS, 1), MOST_CLUSTERS)
-    # Scaled, so that clusters rarely contain links of two transmitters.
+    # Transmitter positions are scaled up, so clusters rarely contain links of two transmitters.
     cluster = spatial_blocks(ends * np.repeat([1000.0, 1.0], 3), count)
     size = np.bincount(cluster)
     residual = residual_db - (np.bincount(cluster, residual_db) / size)[cluster]
@@ -238,7 +237,7 @@ def differing_groups(
     tested: list[Difference] = []
     for column, labels in columns.items():
         names = np.unique(labels)
-        # More labels would be names of links or of positions.
+        # A column with more labels probably names links or positions.
         for name in names if 2 <= len(names) <= 50 else ():
             member = (labels == name).astype(float)
             inside = member - (np.bincount(cluster, member) / size)[cluster]
@@ -317,13 +316,15 @@ MOST_NUMBERS: Final = 12
 """Largest number of distinct values of a numeric column that can be labels of groups, such as days or floors."""
 
 SIGNAL_CORRELATION: Final = 0.5
-"""Rank correlation with path loss above which whole numbers are treated as signal levels, such as channel quality."""
+"""Magnitude of the rank correlation with path loss above which whole numbers are taken for signal levels, not
+labels."""
 
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
 """Smallest number of links of a transmitter for which its direction, which has two angles, is tested."""
 
 MOST: Final = 50
-"""Largest number of tested transmitters, those with the most links; each requires three derivatives of all links."""
+"""Largest number of transmitters that are tested, those with the most links; each requires three derivatives of all
+links."""
 
 
 class Direction(NamedTuple):
@@ -450,7 +451,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """Evaluation at calibrated values, with derivatives for the transmitters' directions and gains; columns by name."""
+    """Evaluation with derivatives by the transmitters' directions and gains, and each parameter's column by name."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}

@@ -1,4 +1,4 @@
-"""Make the result of a finished run, with its accuracy compared with baselines, intervals, and a row for every link."""
+"""Make the result of a finished run: its accuracy and that of baselines, intervals, and a row for every link."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ from calibray.validation.models import log_distance, without_scene
 from calibray.validation.validation import Validation
 
 WORSE_DB: Final = 0.05
-"""Smallest increase of RMSE over that of the initial values which a remark reports [dB]."""
+"""Smallest excess over the RMSE of the initial values that a remark reports [dB]."""
 
 FAINT: Final = "predicted too near the noise floor, left out"
 """Label, in the row counts, of links that the model predicts near the noise floor."""
@@ -85,7 +85,7 @@ class Run:
             traced again.
         cheap: The cheap model, if the method used one.
         enclosed: Antennas inside closed bodies; None if this was not checked.
-        on_links: Remarks on ray mapping, links without a path, directions of antennas, and groups of links.
+        on_links: Remarks on ray mapping, links without a path, antenna directions, missing regions and groups of links.
         timing: Times taken by the parts of the run.
     """
 
@@ -145,7 +145,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
     chosen = fit_prediction_model(problem, trail, name, residuals, gap_db)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
     prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table, validation))
-    # With a ceiling, links without a path are predicted by the ceiling.
+    # The ceiling, if there is one, predicts links without a path.
     if chosen.model.parameters is not None and objective.ceiling_db is None:
         without_path = ~table["has_path"].to_numpy(bool)
         fallback = fit_fallback(problem, without_path, *log_distance_errors(problem, models, validation))
@@ -242,7 +242,7 @@ def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float
 
 
 def _worse_than_mean(problem: Problem, found_db: float, log_distance_db: float) -> tuple[Remark, ...]:
-    """A remark if the calibrated model fits worse than the mean measured path loss, as if links were confused."""
+    """A remark if the calibrated model fits worse than the mean measured path loss, as with mixed-up links."""
     objective = problem.objective
     mean = np.average(objective.measured, weights=objective.weight)
     mean_db = rmse_of(problem, np.full(problem.num_links, mean), objective.weight > 0)

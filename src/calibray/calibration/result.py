@@ -40,7 +40,7 @@ class Result(Record):
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
-        """Read a result that `save` wrote; with `allow_changed_inputs`, also a result with edited files.
+        """Read a result that `save` wrote; with `allow_changed_inputs`, also one whose files were edited.
 
         Raises:
             InputError: The folder contains no result, or the result is from another version, damaged or edited.

@@ -3,8 +3,8 @@
 The gain of a path is a = (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx, with amplitude spreading A, antenna fields E and
 one Jones matrix J for each interaction.
 
-Path programs are evaluated in double precision by default, and in single precision on request. While they run,
-functions use separate JAX settings (`calibray.fields.jax_settings`); importing the package does not change JAX's
+Path programs are evaluated in double precision by default, and in single precision on request. While they run, these
+functions use their own JAX settings (`calibray.fields.jax_settings`); importing the package does not change JAX's
 settings.
 """
 

@@ -3,9 +3,9 @@
 Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions of
 pairs work element by element and are differentiable.
 
-A segment consists of the paths of a link, or the interactions of a link with a material. XLA scatters and adds one
-number at a time, which takes about 5 ns. Most numbers can be added in blocks instead. Numbers are ordered so that each
-block belongs to one segment, and only the remainder of each segment is scattered.
+A segment consists of the paths of a link, or of a link's interactions with one material. XLA scatters and adds one
+number at a time, which takes about 5 ns each. Most numbers can be added in blocks instead. Numbers are ordered so that
+each block belongs to one segment, and only the remainder of each segment is scattered.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class Segments:
 
 
 def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
-    """Order numbers for summation by their segments [n]; the order depends only on `segment`."""
+    """Prepare sums over segments, from the segment of each number [n] and the number of segments."""
     size = np.bincount(segment, minlength=count)
     if not (size >= BLOCK).any():
         return Segments(None, jax.device_put(segment.astype(np.int32)), 0, count)

@@ -28,7 +28,7 @@ from calibray.paths import Paths
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ChannelStatistics:
-    """Second-order statistics of every link; NaN for a link without a path.
+    """Delay and angle statistics and K-factor of every link; NaN for a link without a path.
 
     Attributes:
         mean_delay: Mean delay [L], [s].

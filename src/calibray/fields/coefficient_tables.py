@@ -57,7 +57,7 @@ _EXTRA_NODES: Final = 3
 interval, and one after it."""
 
 _STENCIL: Final = 3
-"""Number of nodes that `table_error` requires on either side of a node."""
+"""Number of nodes that `table_error` requires on each side of a node."""
 
 
 @jax.tree_util.register_dataclass
@@ -72,8 +72,8 @@ class TableLayout:
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
-        rank: Number of every node in its row, 0 for the node before grazing incidence [N].
-        inner: Whether a node has at least three other nodes of its row, or their mirror images, on either side [N].
+        rank: Index of every node in its row, 0 for the node before grazing incidence [N].
+        inner: Whether a node has at least three other nodes of its row, or their mirror images, on each side [N].
     """
 
     cell: tuple[jax.Array, ...]

@@ -68,7 +68,7 @@ class ExtraLoss:
     Attributes:
         length: Length of every path inside the regions, times the ratio of the specific attenuation at the paths'
             carrier to that at the study's carrier [P], [m].
-        maximum_db: Loss of a very long path [dB].
+        maximum_db: Limit that the loss approaches for long paths in the regions [dB].
         index: Index of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
         fixed: The specific attenuation if it is fixed [dB/m].
     """
@@ -132,7 +132,7 @@ class DisplacementLoss:
     Attributes:
         link: Link of every path [P].
         group: Group of every link [K, L].
-        weights: Displacement of every group per unit of each effect parameter, K of [G, e].
+        weights: Displacement of every group per unit of each effect parameter; for each axis an array [G, e], [m].
         origin: Values of the effect parameters at which the paths were traced [e].
         knots: Traced displacements of every link, ascending [K, N, L], [m]; beyond them the change is constant.
         coefficients: Coefficients of the cubics in the distance from the lower knot, highest power first

@@ -49,7 +49,7 @@ from calibray.materials import Material
 from calibray.paths import Paths
 
 WITHOUT_TABLES: Final = np.zeros((1, 1, 3))
-"""Errors of coefficients that are not interpolated from tables, for any number of candidates."""
+"""Interpolation errors of coefficients if no tables are used; the array broadcasts over candidates and materials."""
 
 
 @jax_settings()
@@ -145,7 +145,7 @@ def path_losses(
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
         return np.asarray(_losses(program, tables, None, count, combining))[:count], WITHOUT_TABLES
-    # Tables are looked up where coefficients are used, which is fastest if each is used once.
+    # Looking up coefficients where they are used is fastest if each is used only once.
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
     for table in tables[:count]:

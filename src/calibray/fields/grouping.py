@@ -1,8 +1,8 @@
 """Groups of paths that are evaluated together, and the sequence of their interactions.
 
-Paths of a group have interactions of the same kinds in the same order, so that every step of a group is a dense array.
-With padding, paths that differ only in the lengths of their runs of reflections and transmissions belong to the same
-group. Shorter runs are padded with interactions that have no effect.
+Paths of a group have interactions of the same kinds in the same order, so every step of a group is a dense array. With
+padding, paths that differ only in the lengths of their runs of reflections and transmissions belong to the same group.
+Shorter runs are padded with interactions that have no effect.
 """
 
 from __future__ import annotations
@@ -99,14 +99,14 @@ def padded_groups(paths: Paths) -> list[PathGroup]:
 
 
 def _numbers(paths: Paths) -> NDArray[np.int64]:
-    """Index in `_LETTERS` of every interaction [I]."""
+    """Index in `_LETTERS` of every interaction's letter [I]."""
     return np.select(
         [paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], _COEFFICIENT_NUMBER
     ).astype(np.int64)
 
 
 def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One code for each path [P]; codes are equal for equal sequences of numbers, and zeros are skipped."""
+    """One code for each path [P], equal for paths with equal sequences of numbers, in which zeros are skipped."""
     depth, code = np.diff(paths.first), np.zeros(paths.num_paths, dtype=np.int64)
     for step in range(int(depth.max(initial=0))):
         deep = np.flatnonzero(depth > step)

@@ -1,6 +1,6 @@
 """Calibray's use of JAX: settings, a store of compiled programs, and their compilation.
 
-Outside of Calibray's calls, the user's settings apply.
+Outside Calibray's calls, the user's settings apply.
 
 Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes.
 A compiled program is machine code, so it is read only from a folder that nobody but the user can write to
@@ -156,8 +156,7 @@ WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
 processors the option has no effect. The results are the same."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
-"""The same options without XLA's emitters of fused loops, for faster compilation. The results differ by rounding
-errors."""
+"""The same options without XLA's fusion emitters, for faster compilation. The results differ by rounding errors."""
 
 
 def compiled(

@@ -37,9 +37,9 @@ LARGE: Final = 50_000
 """Number of interactions above which a program is large; with tables, large programs are not padded."""
 
 SMALL: Final = 300
-"""Largest number of coefficients in a small program. With 120 coefficients, path loss and derivatives compile in 2.3 s
-instead of 3.4 s, and a candidate takes up to 20 us longer. With 960 coefficients, a candidate takes 135 us longer
-(`docs/measurements/speed.md`)."""
+"""Largest number of coefficients in a small program, which is compiled without XLA's fusion emitters. With 120
+coefficients, path loss and derivatives compile in 2.3 s instead of 3.4 s, and a candidate takes up to 20 us longer.
+With 960 coefficients, a candidate takes 135 us longer (`docs/measurements/speed.md`)."""
 
 
 @jax.tree_util.register_dataclass
@@ -54,7 +54,8 @@ class Group:
             k.
         turn: For each diffuse step, (cos, sin) of the rotation from the frame of incidence into the basis (theta, phi)
             [2, n]; None for other steps.
-        wedge: Per step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n]; None for other steps.
+        wedge: For each diffraction step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n]; None for
+            other steps.
         signature: One letter for each step; see `calibray.fields.grouping`.
         size: Number of paths n.
     """
@@ -193,10 +194,10 @@ def layout(
     """Lay out a path program for evaluation in a given precision on JAX's default device.
 
     With `intervals`, one number or one for each material and mode [M, 3], the coefficients are tabulated by angle of
-    incidence. If it is None, the slab formula is evaluated at every interaction. With `phases`, the links and delays of
-    the paths are stored. Without `phases`, only sums of powers can be computed.
+    incidence. Without `intervals`, the slab formula is evaluated at every interaction. With `phases`, the links and
+    delays of the paths are stored. Without `phases`, only sums of powers can be computed.
     """
-    # Use jax.device_put: jnp.asarray compiles a program for every shape, which takes 15 ms each.
+    # Use jax.device_put: jnp.asarray compiles a program for every shape, which takes 15 ms.
     padded = intervals is None or paths.num_interactions <= LARGE
     path_groups = padded_groups(paths) if padded else exact_groups(paths)
     order = _joined([group.paths for group in path_groups])

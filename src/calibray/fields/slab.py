@@ -21,7 +21,7 @@ gathered: XLA gathers one number at a time, but vectorizes comparisons."""
 
 
 class Mode(IntEnum):
-    """Use of a coefficient."""
+    """Kind of a slab coefficient."""
 
     REFLECTION = 0
     """Coefficient of a specular reflection or a wedge face; reduced by the scattered energy."""

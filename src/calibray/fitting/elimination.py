@@ -1,8 +1,8 @@
 """Elimination of the nuisance: the best coefficients and the projected derivatives of all candidates together.
 
 Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
-minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. With one column per link, each
-coefficient is a clipped weighted mean.
+minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. If each link has an entry in only one
+column, each coefficient is a clipped weighted mean.
 
 Otherwise the normal equations have an arrowhead matrix: diagonal blocks bordered by a few columns. Columns of different
 groups share no link, so they form separate blocks. Columns over all links overlap with every block and form the border.
@@ -10,10 +10,10 @@ Block elimination solves the system in about the time needed to read the matrix,
 
 Block principal pivoting (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block pivoting and
 interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of Computation 63,
-1994) enforces the bounds in all problems of a batch simultaneously. Each iteration fixes the components that leave
-their bounds, releases the fixed components whose gradient points inwards, and solves again. If the number of infeasible
-components stops decreasing, only the last of them is exchanged (Murty's rule), which guarantees termination. The result
-meets the optimality conditions exactly, without a step length or a convergence tolerance.
+1994) enforces the bounds in all problems of a batch simultaneously. Each iteration fixes components outside their
+bounds at the bound, releases the fixed components whose gradient points inwards, and solves again. If the number of
+infeasible components stops decreasing, only the last of them is exchanged (Murty's rule), which guarantees termination.
+The result meets the optimality conditions exactly, without a step length or a convergence tolerance.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ DEPENDENT: Final = 1e-10
 preceding columns. Rounding leaves about 1e-16 per column."""
 
 PRIOR: Final = 1e-6
-"""Weight of the prior on a linearly dependent column, relative to its squared norm. In 600 random problems with bounds,
-three sums of squares are then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose one digit of
+"""Weight of the prior on a linearly dependent column, relative to its squared norm. In three of 600 random problems
+with bounds, the sum of squares is then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose one digit of
 accuracy."""
 
 ROUNDING: Final = 1e-11
@@ -105,7 +105,7 @@ class Elimination:
             lower=nuisance.lower,
             upper=nuisance.upper,
             separable=len(nuisance.terms) == 1,
-            # A prior makes even a column without links regular.
+            # With a prior, even a column without links is independent of the others.
             determined=determined & (data.diagonal() > 0),
         )
 

@@ -29,14 +29,14 @@ def retrace(
     """Trace with the calibrated materials, and calibrate again as long as path loss changes by more than the tolerance.
 
     The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
-    them. Path loss at displaced antennas is interpolated. If none of these applies, the paths are not traced again.
-    Only the method `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of `progress` is
-    "checking".
+    them. Path loss at displaced antennas is interpolated. If a study uses none of these, the paths are not traced
+    again. Only the method `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of
+    `progress` is "checking".
 
     Returns:
-        The problem of the last calibration, its search, and the gap of every link [L], [dB]; the gap is None if not
-        checked. It is the path loss on paths traced with the calibrated materials minus that on the paths of the
-        calibration.
+        The problem of the last calibration, its search, and the gap of every link [L], [dB]; the gap is None if the
+        paths were not traced again. It is the path loss on paths traced with the calibrated materials minus that on the
+        paths of the calibration.
     """
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine
@@ -108,7 +108,7 @@ def with_interpolation_error(
 
 
 def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change of path loss [L], [dB]; 0 for a link without a path in either trace, infinite if only one has a path."""
+    """Change of path loss [L], [dB]; 0 if neither trace has a path for the link, infinite if only one has."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
 
@@ -119,7 +119,7 @@ def traced_again(path_loss_db: NDArray[np.float64], gap: NDArray[np.float64]) ->
 
 
 def largest_gap(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
-    """Largest gap of the links with weight and a path in both traces [dB]; None if not checked."""
+    """Largest gap of the links with weight and a path in both traces [dB]; None if `gap` is None."""
     if gap is None:
         return None
     return float(np.abs(gap[counted & np.isfinite(gap)]).max(initial=0.0))

@@ -1,8 +1,8 @@
 """The objective that a calibration minimises.
 
-It is the paper's weighted RMSE (eq. 1) over the links with nonzero weight. Nuisances (an offset or other columns of a
-linear design) enter the model as path loss + design x coefficients. For every candidate, the best coefficients follow
-in closed form (variable projection), so optimizers search only the parameters.
+The objective is the paper's weighted RMSE (eq. 1) over the links with nonzero weight. Nuisances (an offset or other
+columns of a linear design) enter the model as path loss + design x coefficients. For every candidate, the best
+coefficients follow in closed form (variable projection), so optimizers search only the parameters.
 
 A Gaussian prior on a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
 of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows; `rmse` is
@@ -178,7 +178,7 @@ class Objective:
     def determined(self) -> NDArray[np.bool_]:
         """Mask of the columns that the links with weight determine [q].
 
-        Examples of undetermined coefficients are the offset of a group without these links, or the slope of a group in
+        Examples of undetermined coefficients are the offset of a group without such links, or the slope of a group in
         which all links have the same distance.
         """
         if not self.nuisance.terms:
@@ -187,7 +187,8 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that the links determine; one with a prior counts as their share of its precision.
+        """Number of coefficients that the links determine; one with a prior counts as the links' share of its
+        precision.
 
         Coefficients that their priors hold at zero explain no residuals, regardless of the number of groups.
         """
@@ -304,7 +305,7 @@ class Objective:
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [L], [dB], plus the nuisance fitted to links with weight; groups without them have the mean."""
+        """Path loss [L], [dB], plus the nuisance fitted to links with weight; other groups get the mean."""
         return self.capped(path_loss) + self.nuisance.contribution(self.completed(path_loss[None]))[0]
 
     def _model(

@@ -40,7 +40,7 @@ class Observed:
         name: Name of the observable in the study.
         statistic: The modelled quantity.
         measured: Measured values [L], in the study's unit; NaN for a link without a value.
-        scale: The study's unit, expressed in SI units.
+        scale: Size of the study's unit in SI units.
         group: Index of the group of each link's bias [L]; -1 without a bias.
         labels: Labels of the groups; empty without a bias.
         std: Standard deviation of a value's error, in the study's unit.

@@ -106,7 +106,7 @@ class Problem:
 
         Raises:
             InputError: No calibration link is left, or a group has only held-out links.
-            EngineError: The engine's answer has not one finite or infinite value per link.
+            EngineError: The engine did not return one value per link.
         """
         setup = setup.with_position_noise()
         study, links, held_out = setup.study, setup.links, setup.held_out
@@ -165,7 +165,7 @@ class Problem:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom: calibration links minus fitted unknowns; below 1 the noise cannot be estimated."""
+        """Degrees of freedom: calibration links minus fitted unknowns; below 1, the noise cannot be estimated."""
         return self.objective.num_counted - len(self.parameters) - self.objective.fitted
 
     @cached_property

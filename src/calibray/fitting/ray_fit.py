@@ -41,7 +41,7 @@ EVALUATIONS: Final = (6, 12, 30)
 """Largest number of evaluations with each loss function: in a trial, between scans, and in the last refinement."""
 
 TRIALS: Final = 300
-"""Largest number of trials of basin hopping. A stop after 150 trials without improvement gave about the same
+"""Largest number of trials of basin hopping. Stopping after 150 trials without improvement gave about the same
 misfits."""
 
 TRIED_PATHS: Final = 500_000
@@ -212,7 +212,8 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """Mask of the materials on each path [P, M]; and materials with a parameter, those alone on most paths first."""
+    """Mask of the materials on each path [P, M]; and materials with a parameter, by the number of paths with no
+    other."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True

@@ -45,14 +45,14 @@ DRAWS: Final = 3
 """Number of sets of assumed constants over which the information is averaged."""
 
 DRAWN: Final = 3.0
-"""Largest factor between an assumed constant of such a set and the study's value."""
+"""Largest factor between an assumed constant in one of these `DRAWS` sets and the study's value."""
 
 SIGMA_DB: Final = 0.1
 """Standard deviation of a ratio's error assumed in the information matrix [dB]."""
 
 LEFT_DB: Final = 0.05
-"""An optimum counts as reached only if the best call and the minimum of the replay differ by at most this much, in RMSE
-and in path loss [dB]."""
+"""An optimum counts as reached only if the best call and the minimum of the replay differ by at most this much, in the
+objective and in RMS path loss [dB]."""
 
 GAP_DB: Final = 0.2
 """An optimum counts as reached only if the gap at the last call is at most this large [dB]. After six calls, the excess
@@ -68,9 +68,9 @@ CHANGED_DB: Final = 0.5
 [dB]. Paths that appear between calls may be missing at the minimum of the replay."""
 
 SEARCHES: Final = 4
-"""Ratio of the number of local searches to that of a calibration on replay; a call costs more than many searches. In a
-district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds;
-2,048 searches found it with all five."""
+"""Number of local searches relative to a calibration by replay; a call costs more than many searches. In a district
+with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds; 2,048
+searches found it with all five."""
 
 LEAST_CALLS: Final = 3
 """Smallest number of calls of ray mapping: two to identify the assumptions, and one at the minimum."""
@@ -94,7 +94,7 @@ class RayMap:
         changed_db: Largest change of a link's path loss if these paths are left out, over links that keep a path [dB].
         lost: Number of links that keep no path, or that have no path in the replay at the best call.
         minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
-        remaining_db: RMSE at the best call minus that at the lowest of these minima [dB].
+        remaining_db: Objective on this replay at the best call minus that at the lowest of these minima [dB].
         moved_db: RMS over the links of the replay's path loss at that minimum minus that at the best call [dB].
     """
 

@@ -55,7 +55,7 @@ TILT: Final = 0.3
 of base stations."""
 
 ANGLES: Final = 3
-"""Number of angles of an end: the slant and two tilts."""
+"""Number of angles of the antenna at one end: the slant and two tilts."""
 
 BATCH: Final = 8
 """Number of candidates that are evaluated together; the program is compiled for this number."""
@@ -119,7 +119,7 @@ class RayModel:
 
     @cached_property
     def start(self) -> NDArray[np.float64]:
-        """The study's constants, and upright vertical polarization."""
+        """The values [k] of the study's constants and, if antennas are unknown, of vertical polarization."""
         constants = [np.log(getattr(self.paths.materials[name], field)) for name, field in self.assumed]
         return np.array(constants + [0.0] * (0 if self.known else 2 * ANGLES))
 

@@ -154,7 +154,7 @@ class Trail:
         candidates: The candidates in the fields' units, each [d].
         rmse_db: RMSE of each candidate [dB].
         best_db: RMSE of the best candidate up to each call [dB].
-        iteration: Number of the round of each call, counted from 1.
+        iteration: Round of each call, counted from 1.
         seconds: Time from the start to each call [s].
         best: The best candidate [d].
         best_modelled: The engine's values for the best candidate [L].

@@ -151,7 +151,7 @@ def compile_chains(chains: Chains) -> Geometry:
             rows, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
             edge, normal_n = chains.edge[rows, step], chains.normal_n[rows, step]
             before, after = chains.edge_lengths[rows, step].T
-            # An edge multiplies the amplitude by sqrt(s' / (s (s' + s))); it is 1/s' at the first edge.
+            # An edge multiplies the amplitude by sqrt(s' / (s (s' + s))); the amplitude at the first edge is 1/s'.
             arriving = np.where(spread[rows] > 0, spread[rows], 1 / before)
             spread[rows] = arriving * np.sqrt(before / (after * (before + after)))
             constants = _wedge(k_in, k_out, normal[wedge], normal_n, edge, before * after / (before + after))
