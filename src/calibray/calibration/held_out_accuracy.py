@@ -132,7 +132,8 @@ def _choice(
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
         ends = np.hstack([setup.links.tx, setup.links.rx])
-        # These links were held out together; blocks only separate the two levels of their errors.
+        # These links were held out together; blocks serve only to separate errors within blocks from those between
+        # blocks.
         block = place_blocks(moving_end(setup.links)[judged][finite], DEFAULT_BLOCKS)
         levels = two_levels(errors[name], block, ends[judged][finite], ends[objective.weight > 0])
         if levels is not None:

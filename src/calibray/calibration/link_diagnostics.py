@@ -182,8 +182,8 @@ FEWEST_CLUSTERS: Final = 8
 """Smallest number of clusters that contain links both inside and outside a group."""
 
 MIXED: Final = 0.5
-"""Smallest share of the variance of membership within clusters for which a group is tested; with a smaller share, the
-group is a location."""
+"""Smallest share of the variance of membership that must lie within clusters for a group to be tested; with a smaller
+share, the group is a location."""
 
 SIGNIFICANCE: Final = 0.01
 """Probability of a false remark about any group of any column, or about any antenna direction."""
@@ -313,7 +313,7 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
 
 
 MOST_NUMBERS: Final = 12
-"""Largest number of distinct values of a numeric column that can be labels of groups, such as days or floors."""
+"""Largest number of distinct values for which a numeric column, such as days or floors, can label groups."""
 
 SIGNAL_CORRELATION: Final = 0.5
 """Magnitude of the rank correlation with path loss above which whole numbers are taken for signal levels, not

@@ -1,10 +1,9 @@
 """Tables of the slab coefficients by angle of incidence, for programs with many interactions.
 
 A coefficient depends on the geometry only through the cosine of incidence. If a program has many more interactions than
-its tables have nodes, each candidate's coefficients are computed at the nodes. Cubic polynomials through four nodes
-then interpolate between the nodes, which takes about 10 ns per interaction instead of 100 ns. The position of an
-interaction in its table does not depend on the materials, so it is computed once. Each pair of material and mode has a
-separate row of nodes.
+its tables have nodes, each candidate's coefficients are computed at the nodes. Interpolation by cubic polynomials
+through four nodes then takes about 10 ns per interaction instead of 100 ns. The position of an interaction in its table
+does not depend on the materials, so it is computed once. Each pair of material and mode has a separate row of nodes.
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
 very close to grazing incidence. A sheet of plasterboard at 2 GHz requires about a hundred intervals, and a thick slab

@@ -263,7 +263,7 @@ def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) 
 def _share(
     weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Share of each link's weight with values in the bin [L], [dB]; an empty bin has minus the dynamic range."""
+    """Share of each link's weight with values in the bin [L], [dB]; minus the dynamic range if the bin is empty."""
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db

@@ -187,8 +187,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that the links determine; one with a prior counts as the links' share of its
-        precision.
+        """Number of coefficients that the links determine; under a prior, only the links' share of the precision.
 
         Coefficients that their priors hold at zero explain no residuals, regardless of the number of groups.
         """

@@ -113,7 +113,7 @@ def _far_from(
     objective: Objective,
     weight: NDArray[np.float64],
 ) -> Objective:
-    """The objective with weights [L] only for the links with a predicted path loss of at most `largest_db` [L]."""
+    """The objective with weights [L] that are 0 for links with a predicted path loss above `largest_db` [L]."""
     return objective.reweighted(np.where(predicted_db <= largest_db, weight, 0.0))
 
 

@@ -245,7 +245,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         trail.compare(start, problem.judge(start, answer), 0)
     if not np.isfinite(trail.best_rmse_db):
         raise InputError(
-            "every candidate loses the path of at least one link; exclude such links or use no_path = 'censor'"
+            "for every candidate, at least one link has no path; exclude such links or use no_path = 'censor'"
         )
     trail.minima = optimizer.minima
     if not len(trail.best_modelled):

@@ -34,9 +34,9 @@ class Chains:
         probability: Probability with which the tracer chose the kind of interaction [P, D].
         samples: Number of rays launched per source.
         edge: Directions of the diffracting edges [P, D, 3], read only at diffractions; empty without diffraction.
-        normal_n: Normals of the n-faces of the wedges [P, D, 3], in the same way.
+        normal_n: Normals of the n-faces of the wedges [P, D, 3], read only at diffractions.
         edge_lengths: Path lengths s' from the source to an edge, and s from this edge to the next one or to the target
-            [P, D, 2], [m], in the same way.
+            [P, D, 2], [m], read only at diffractions.
     """
 
     source: NDArray[np.float64]

@@ -130,7 +130,8 @@ class Paths:
             The program at that carrier.
 
         Raises:
-            InputError: The frequency is not in `calibray.materials.FREQUENCIES`, or a material is not in the paths.
+            InputError: The frequency is outside the range `calibray.materials.FREQUENCIES`, or the paths lack a
+                material.
         """
         return replace(self, frequency=check_frequency(frequency), materials=self._with_materials(materials))
 

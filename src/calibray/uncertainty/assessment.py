@@ -47,8 +47,8 @@ from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_int
 LARGEST_ERROR: Final = 0.5
 """Largest error of the emulator at left-out calls, relative to the RMSE of the best call, for which intervals are
 drawn. With larger errors, candidates near a call fit better only because the emulator is exact there. Without this
-limit, the sets contained 2 of 7 values called identified or weakly identified with 2 calls per parameter, and 14 of 14
-with 8 or 16 (docs/measurements/intervals.md)."""
+limit, the sets of parameters called identified or weakly identified contained 2 of 7 true values with 2 calls per
+parameter, and 14 of 14 with 8 or 16 (docs/measurements/intervals.md)."""
 
 NEGLIGIBLE_DB: Final = 0.05
 """Error of an emulator that is always accepted [dB]; path loss is not measured more precisely."""
@@ -93,7 +93,7 @@ class Certainty:
     """Uncertainty of a calibration.
 
     Attributes:
-        record: The uncertainty that a result states.
+        record: The uncertainty as the result states it.
         posterior: All draws; None if no draws were made.
         calls: Number of replays made for the assessment.
         seconds: Time taken by the assessment [s].
@@ -184,7 +184,7 @@ def _assess(
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
-        # Without more residuals than unknowns, the residuals say nothing about the errors.
+        # Unless there are more residuals than unknowns, the residuals contain no information about the errors.
         reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": optimum.num_rows})
         return Certainty(Uncertainty(_full_ranges(problem.parameters, reason)))
     local = local_intervals(problem, trail, optimum)
@@ -316,7 +316,7 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
     values[:, : len(model.study)] = model.study.from_search(draws.point[kept])
     by_name = dict(zip(parameters.names, values.T.tolist(), strict=True))
     if 0 < len(nuisance.columns) <= MAX_COLUMNS:
-        # Given the parameters, coefficients scatter about their best values; if undetermined, they keep these.
+        # Given the parameters, coefficients scatter about their best values; undetermined ones do not.
         objective = replace(problem.objective, noise_db=model.marginal.noise_db)
         normal = random.standard_normal((len(values), len(nuisance.columns)))
         scatter = np.where(objective.determined, normal @ objective.coefficient_root().T, 0.0)
@@ -411,7 +411,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     parameters = problem.parameters
     candidates = np.stack([parameters.to_search(best), parameters.to_search(parameters.start)])
     terms = objective.nuisance.terms
-    # In units of the largest difference that repeats may have; different groups differ by 2 or more.
+    # Columns in units of the largest difference that repeats may have; different groups differ by 2 or more.
     columns = np.array([
         *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
         *(term.value[counted] / 1e-3 for term in terms),

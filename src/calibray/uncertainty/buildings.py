@@ -80,7 +80,7 @@ class Split(ABC):
     Attributes:
         parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
         building_of: Building of each constant, numbered from 0; -1 for other objects, such as the ground [c].
-        met: Numbers of the buildings that the paths meet.
+        met: Indices of the buildings that the paths meet.
         interactions: Number of interactions that are evaluated for a candidate.
     """
 
@@ -153,7 +153,7 @@ class SplitChunks(Split):
 
 @dataclass(frozen=True)
 class _Splitting:
-    """Settings for splitting replays, which can be pickled. Equal settings split a replay in the same way.
+    """Settings for splitting replays; they can be pickled. Equal settings split a replay in the same way.
 
     Attributes:
         parameters: The study's parameters and further constants.

@@ -64,7 +64,7 @@ class ConstantMean:
     """A constant mean with linear responses, used if there is no replay.
 
     Attributes:
-        centre: Mean path loss [m], [dB].
+        centre: Mean of each emulated row over the calls [m], [dB].
     """
 
     centre: NDArray[np.float64]

@@ -96,7 +96,7 @@ FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 
 NO_EFFECT: Final = 0.02
 """A constant from the scene stays fixed if a change by one standard deviation changes path loss by less than this share
-of the noise level. The resulting variance is then below 0.04 % of the noise variance."""
+of the noise level. The variance that it would add is then below 0.04 % of the noise variance."""
 
 ALIKE: Final = 0.5
 """Prior probability that buildings do not differ."""
@@ -153,12 +153,12 @@ class JointModel:
     observed: tuple[tuple[int, int, bool], ...] = ()
 
     def densities(self, gaps: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Log likelihood of gaps [n], each under its own noise model [n]."""
+        """Log likelihood of gaps, each under the noise model with the given index, plus the model's log weight [n]."""
         links, further = self._split(gaps)
         return self.forms.densities(links, model) + further
 
     def densities_by_model(self, gaps: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log likelihood of gaps under every noise model, plus the logarithm of its prior weight [n, models]."""
+        """Log likelihood of gaps under every noise model, plus the model's log weight [n, models]."""
         links, further = self._split(gaps)
         return self.marginal.densities(links) + further[:, None]
 
@@ -244,7 +244,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     noise_db = float(np.sqrt(square * (freedom + problem.unknowns) / freedom))
     nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
     coefficients = objective.coefficients(problem.modelled(best[None]))[0]
-    # A coefficient at its bound stays there; the others are integrated over all numbers.
+    # A coefficient at its bound stays there; the others are integrated over the real line.
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound

@@ -51,7 +51,7 @@ STRONGEST: Final = 0.05
 def excess_db(problem: Problem) -> NDArray[np.float64]:
     """Excess loss of links out of sight over free space, relative to that of the strongest links [L], [dB].
 
-    It is the median over candidates between the bounds; minus infinity for links in sight, which have a direct path.
+    It is the median over candidates within the bounds; minus infinity for links in sight, which have a direct path.
     """
     from scipy.stats import qmc  # takes 0.4 s
 

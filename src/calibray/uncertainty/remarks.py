@@ -1,6 +1,6 @@
 """Checks of a finished calibration that lead to remarks: noise, missed optimum, intervals, undeclared offset, conflict.
 
-Path loss and further observables may contradict each other by more than their errors explain, so that they require
+Path loss and further observables may contradict each other by more than their errors explain. They then require
 different parameters. The parameters are fitted to path loss alone, to the further observables alone, and to both. The
 test statistic is the increase in both sums of squares from the separate fits to the common fit, divided by the
 variances of the errors and by the number of parameters. It follows an F distribution if one set of parameters explains
@@ -125,7 +125,7 @@ def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
         groups = np.unique(each.group[used], return_inverse=True)[1]
         x, y = (column - (np.bincount(groups, column) / np.bincount(groups))[groups] for column in (x, y))
         left = len(used) - (groups.max(initial=0) + 1) - 1
-        # Values that hardly differ from link to link say nothing about a slope.
+        # Values that hardly differ from link to link do not determine a slope.
         if left < FEWEST or np.sum(x**2) <= 1e-12 * np.sum((values[used] / each.scale) ** 2):
             continue
         slope = float(np.sum(x * y) / np.sum(x**2))
@@ -203,7 +203,7 @@ def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, .
 
 
 def _lacking(study: StudyModel) -> list[str]:
-    """Settings of the tracer that would find further paths, as in a study file; empty for an external program."""
+    """Settings of the tracer that would find more paths, written as in a study file; empty for an external program."""
     if study.engine.external:
         return []
     switches = [f"{name} = true" for name in ("refraction", "diffraction") if not getattr(study.trace, name)]

@@ -67,7 +67,7 @@ def assess_richer_paths(
     try:
         paths = setup.trace(materials, with_stage(progress, "tracing more paths"))
     except (InputError, EngineError) as error:  # for example too many paths; the calibration is finished
-        _LOG.warning("No check for %s: %s", " and ".join(changes), error)
+        _LOG.warning("paths with %s could not be tried: %s", " and ".join(changes), error)
         return assessed
     richer = replace(problem, setup=setup, engine=replay(setup, paths))
     counted = problem.objective.weight > 0

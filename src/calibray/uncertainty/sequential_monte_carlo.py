@@ -41,8 +41,8 @@ SWEEPS: Final = 4
 in five dimensions then scatters by 0.03 between seeds. With 2 sweeps, it scatters by 0.08."""
 
 LAST_SWEEPS: Final = (8, 48)
-"""Smallest and largest number of further sweeps at power 1. A population that is smaller because of the budget has more
-sweeps, so that it provides as many draws. On a small program, the number of sweeps is as large as the budget allows. In
+"""Smallest and largest number of further sweeps at power 1. A population that is smaller because of the budget gets
+more sweeps, so it provides as many draws. On a small program, the number of sweeps is as large as the budget allows. In
 districts of 300 to 800 interactions, distribution functions after 8, 24 and 48 sweeps differ by 0.053, 0.043 and 0.036
 from those of a million draws from the prior (`benchmarks/simulation_based.py --reference`). With 8 sweeps of 104
 members, widths of intervals differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 %

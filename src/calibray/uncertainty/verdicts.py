@@ -228,7 +228,7 @@ def verdicts(
     """Judge every parameter by its posterior; if buildings differ, by the posterior of the mean over all buildings.
 
     The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the share `level` of the posterior.
-    `seen` is the posterior for the measured buildings; the same as `draws` if None.
+    `seen` is the posterior for the measured buildings; if None, `draws` is used.
     """
     best = draws.point[np.argmax(draws.density)]
     seen = draws if seen is None else seen

@@ -92,7 +92,7 @@ def fit_prediction_model(
         name: Name of the model; see `Model`.
         residuals: Residuals of the model on new links.
         retrace_gap_db: Change in path loss of every link when the paths of the search are replaced by paths traced with
-            the calibrated materials [L], [dB]; None if not traced again.
+            the calibrated materials [L], [dB]; None if the paths were not traced again.
 
     Returns:
         The fitted model. Predictions and exports trace with its materials, so its values contain this change.

@@ -91,7 +91,7 @@ class Baseline(NamedTuple):
     known_db: NDArray[np.float64]
 
     def path_loss_db(self) -> NDArray[np.float64]:
-        """Path loss at all links [links], [dB]; a group without links with weight has the mean of the others."""
+        """Path loss at all links [links], [dB]; a group without links with weight gets the mean of the others."""
         return self.objective.with_nuisance(self.known_db)
 
 
@@ -317,8 +317,9 @@ def _searches(problem: Problem) -> int:
 def _new_starts(problem: Problem) -> int:
     """Number of additional starting points if minima of the same variant, fitted to more links, are known.
 
-    A large program has fewer points, because its calibration has fewer searches. With one point instead of four, errors
-    on held-out links in Auckland agree within 0.001 dB. On small programs, more points often lead to a lower minimum.
+    A large program gets fewer points, because its calibration makes fewer searches. With one point instead of four,
+    errors on held-out links in Auckland agree within 0.001 dB. On small programs, more points often lead to a lower
+    minimum.
     """
     return min(max(_searches(problem) // STARTS[0], 1), NEW_STARTS)
 

@@ -208,7 +208,8 @@ def fit_models(
     `fit_variants`.
     """
     setup, objective = part.setup, part.objective
-    # If paths are traced around calibrated positions, replay only interpolates path loss at the stated positions.
+    # If paths are traced around calibrated positions, replay only interpolates path loss at the stated positions;
+    # `before` is exact.
     path_loss_db: dict[str, NDArray[np.float64]] = {
         name: variant.objective.with_nuisance(
             part.before if name == Model.INITIAL else variant.modelled(minima[:1])[0]
