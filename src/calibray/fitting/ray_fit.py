@@ -212,8 +212,7 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """Mask of the materials on each path [P, M]; and materials with a parameter, those alone on the most paths
-    first."""
+    """Mask of the materials on each path [P, M]; materials with a parameter, those alone on the most paths first."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
