@@ -63,10 +63,11 @@ def calibrate(
 ) -> Result:
     """Calibrate a scene's materials against measurements.
 
-    Suspicious positions and values of the links are logged as warnings. The links of an opened study are not checked.
+    Suspicious positions and values of the links are logged as warnings. The links of a study that is already open are
+    not checked.
 
     Args:
-        study: The study, opened or not.
+        study: The study; it may already be open.
         method: Method to use instead of the study's: "auto", "sgwo-im", "gwo", ...
         seed: Seed to use instead of the study's.
         out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is also written
@@ -164,6 +165,6 @@ def calibrate(
     run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
     result = make_result(run, assessment, validation)
     if out is not None:
-        # The folder was checked before the search; a file that appeared since then must not prevent saving.
+        # The folder was checked before the search; a file that has appeared since must not prevent saving.
         result.save(out, overwrite=True)
     return result

@@ -2,7 +2,7 @@
 
 The fallback is a log-distance model with the study's nuisances. It is fitted to the calibration links, like the
 log-distance baseline in validation. Links without a path are behind obstacles, so their path loss usually exceeds the
-prediction of this fit. If enough of these links were measured, or else enough links out of sight, their mean residual
+prediction of this fit. If enough of these links, or else enough links out of sight, were measured, their mean residual
 is added to the prediction. Their scatter then determines the fallback's errors.
 """
 
@@ -232,7 +232,7 @@ def fit_fallback(
     measured = ~setup.held_out if links.censored is None else ~setup.held_out & ~links.censored
     usable, name = without_path & measured, WITHOUT_PATH
     usable = usable if problem.faint is None else usable & ~problem.faint
-    # Lines of sight take time, so they are only computed if needed.
+    # Lines of sight take time, so they are computed only if needed.
     if usable.sum() < FEW and OUT_OF_SIGHT in (table := setup.with_obstruction().links.table).frame:
         usable, name = (table.numbers(OUT_OF_SIGHT) > 0) & measured, OUT_OF_SIGHT.replace("_", " ")
     count = int(usable.sum())

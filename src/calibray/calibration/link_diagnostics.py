@@ -43,7 +43,7 @@ DENSE: Final = 20_000_000
 160 MB."""
 
 DIRECT: Final = "line of sight"
-"""Name of the power share of paths without interactions."""
+"""Label of the power share of paths without interactions."""
 
 
 @dataclass(frozen=True)
@@ -411,9 +411,9 @@ def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
     """Test whether transmit antenna directions other than the stated ones would explain the residuals.
 
-    For each transmitter, an F test adds two columns to the parameters, the nuisance and a gain of the transmitter.
-    These columns are the derivatives of path loss with respect to azimuth and downtilt at the calibrated values [d].
-    The problem must use stored paths; the remark names the transmitters.
+    For each transmitter, an F test adds two columns to a model with the parameters, the nuisance and a gain of the
+    transmitter. These columns are the derivatives of path loss with respect to azimuth and downtilt at the calibrated
+    values [d]. The remark names the transmitters. Without stored paths, there is no remark.
     """
     setup, engine = problem.setup, problem.engine
     study, table = setup.study, setup.links.table

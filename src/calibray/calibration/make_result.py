@@ -59,7 +59,7 @@ from calibray.validation.models import log_distance, without_scene
 from calibray.validation.validation import Validation
 
 WORSE_DB: Final = 0.05
-"""Smallest excess over the RMSE of the initial values that a remark reports [dB]."""
+"""Excess over the RMSE of the initial values above which a remark is made [dB]."""
 
 FAINT: Final = "predicted too near the noise floor, left out"
 """Label, in the row counts, of links that the model predicts near the noise floor."""
@@ -86,7 +86,7 @@ class Run:
         cheap: The cheap model, if the method used one.
         enclosed: Antennas inside closed bodies; None if this was not checked.
         on_links: Remarks on ray mapping, links without a path, antenna directions, missing regions and groups of links.
-        timing: Times taken by the parts of the run.
+        timing: Durations of the parts of the run.
     """
 
     problem: Problem
@@ -342,8 +342,8 @@ def observable_fits(
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
     """The fit of every further observable by name, and its columns in the table of links.
 
-    The columns are the measured, initial and calibrated values and the biases [L], in the unit of the observable. The
-    posterior draws, by name of the parameter, can be empty.
+    The columns are the measured, initial and calibrated values and the biases [L], in the unit of the observable.
+    `draws` contains the posterior draws by parameter; it may be empty.
     """
     problem = run.problem
     if not problem.observed:
@@ -367,7 +367,7 @@ def observable_fits(
             if spread
             else biases
         )
-        # The error of the mean, and the error due to the parameters.
+        # The standard error of the mean, combined with the error due to the parameters.
         errors = np.sqrt(
             observable.std**2 / np.maximum(count, 1) + np.mean((of_draws - biases)[:, groups] ** 2, axis=0)
         )

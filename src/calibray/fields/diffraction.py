@@ -27,7 +27,7 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
 
     def term(sign: int, beta: NDArray[np.float64]) -> NDArray[np.complex128]:
         """One of the four terms D_i (Kouyoumjian and Pathak 1974, eq. 25; ITU-R P.526-15 eqs. 66-69)."""
-        # a(beta) = 2 cos^2((2 n pi N - beta) / 2), N the integer that best meets 2 pi n N - beta = +-pi
+        # a(beta) = 2 cos^2((2 n pi N - beta) / 2), where N is the integer that best meets 2 pi n N - beta = +-pi
         turns = np.round((beta + sign * np.pi) / (2 * exterior))
         a = 2 * np.cos(exterior * turns - beta / 2) ** 2
         return scale * _cotangent_times_transition((np.pi + sign * beta) / (2 * n), size * a, n, size)

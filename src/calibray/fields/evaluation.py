@@ -1,9 +1,9 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
 With the slab formula, one compiled loop evaluates the candidates of a batch one by one. The data of one candidate
-therefore stay in the core's L1 cache, and a smaller batch takes less time. Within the loop, the stages are materialized
-(`calibray.fields.arithmetic.materialize`). Otherwise, XLA on the CPU would fuse each stage into all of its uses and
-repeat it there.
+therefore stay in the core's L1 cache, and a smaller batch takes proportionally less time. Within the loop, the stages
+are materialized (`calibray.fields.arithmetic.materialize`). Otherwise, XLA on the CPU would fuse each stage into all of
+its uses and repeat it there.
 
 Large programs with tables are evaluated in stages that are compiled separately. A single stage interpolates
 coefficients, propagates the fields and computes the power, so that it reads every constant once and writes one number

@@ -229,7 +229,7 @@ def layout(
 class _Numbering:
     """Indices of the coefficients in the order in which the steps of all groups use them.
 
-    Coefficients are numbered by interaction, followed by those of the n-faces of diffracting wedges.
+    The coefficients of all interactions come first, then those of the n-faces of diffracting wedges.
 
     Attributes:
         wedges: Interaction indices of the diffractions [W].

@@ -147,7 +147,7 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
                 "two or more links are required: add measurements, or change [holdout]"
             )
         group, labels = _groups(links, section.bias)
-        # Equal values have no deviation; the error is estimated from the residuals later.
+        # Equal values have no deviation; 1 is used until the error is estimated from the residuals.
         std = float(np.nanstd(measured)) or 1.0 if section.std is None else section.std
         every.append(
             Observed(

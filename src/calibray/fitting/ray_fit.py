@@ -2,8 +2,8 @@
 
 Materials are added one at a time. Each material is scanned (`ray_scan.py`) on paths without materials that are added
 later. Least squares with exact derivatives on all these paths then refines the best points, for several polarizations,
-jointly with the values already found. The best few explanations are kept. The study's constants are a further starting
-point, with the polarizations that fit best with them. If a misfit remains, linear polarizations are searched with the
+jointly with the values already found. The best few explanations are kept. A further starting point combines the study's
+constants with the polarizations that fit them best. If a misfit remains, linear polarizations are searched with the
 materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
 Doye, 1997): it moves one or two materials to other resonances and refines the result.
 """
@@ -313,7 +313,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
             kept[key] = errors, slopes[:, free]
         return kept[key]
 
-    # SciPy's stubs do not accept a function as Jacobian.
+    # SciPy's stubs do not accept a function as a Jacobian.
     slopes = cast(Any, lambda values: evaluate(values)[1])
     weights = np.concatenate([ratio.weight for ratio in ratios])
     scale = ray_scan.ROBUST_DB * float(np.sqrt(weights.mean()))

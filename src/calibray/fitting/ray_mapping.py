@@ -157,7 +157,7 @@ def search_rays(
 
     def ask(candidate: NDArray[np.float64]) -> Export:
         export = engine.export(candidate)
-        # `engine` keeps its answers, so a repeated candidate is no further call.
+        # `engine` keeps its answers, so a repeated candidate does not count as a call.
         if any(np.array_equal(candidate, earlier) for earlier in trail.candidates):
             return export
         evaluation = problem.evaluate_candidates(candidate[None])

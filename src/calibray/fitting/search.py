@@ -239,7 +239,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
     if not (problem.differentiable or problem.observed):
-        # The engine was called for the initial values before the search.
+        # The engine was called for the initial values before the search, so they are compared as well.
         start = problem.parameters.start[None]
         answer = Responses(problem.before[None], np.zeros((1, 0, problem.num_links)))
         trail.compare(start, problem.judge(start, answer), 0)

@@ -6,8 +6,8 @@ The seal is a checksum at the start of the file, which is verified before anythi
 block in front of the content. This block contains the SHA-256 digest of the content as one line of text. A damaged file
 can hang or crash the HDF5 library (one hang and one crash in 3,000 files with flipped bits), so the library reads a
 file only if the checksum matches. A file from a different source may have been changed and sealed again (reading 5 of
-3,000 such files took more than a minute). Such a file is first read in a process with limits. A file that Calibray
-wrote or validated earlier for the same user is recognized by its checksum and read directly.
+3,000 such files took more than a minute). Such a file is first read in a process with limited memory and time. A file
+that Calibray wrote or validated earlier for the same user is recognized by its checksum and read directly.
 """
 
 from __future__ import annotations

@@ -396,7 +396,7 @@ def _paths(content: file_format.Content) -> Paths:
 
 
 def _summary(paths: Paths) -> dict[str, str]:
-    """Summary of the paths for a terminal or notebook, as texts by heading."""
+    """Summary of the paths for a terminal or notebook, as text by heading."""
     num_unreached = len(paths.links_without_path)
     counts = np.bincount(paths.kind, minlength=max(Kind) + 1)
     kinds = [f"{counts[kind]:,} {kind.name.lower()}" for kind in Kind if counts[kind]]

@@ -114,7 +114,7 @@ def certainty(
     "drawing".
     """
     started = time.perf_counter()
-    # Matrices of few links are small; BLAS threads cost more than they save.
+    # With few links, matrices are small, and BLAS threads cost more time than they save.
     with single_blas_thread(problem.objective.num_counted <= FEW_LINKS):
         if problem.differentiable:
             before = problem.engine.calls

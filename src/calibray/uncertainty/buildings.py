@@ -232,7 +232,7 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
     is equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
     """
     engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
-    # Weak paths often arrive late, and delay spreads depend on late paths.
+    # Weak paths often arrive late, and delay spreads depend on late paths, so further observables need all paths.
     may_drop = problem.setup.study.objective.combining == "power" and not problem.observed
     splitting = _Splitting(parameters, may_drop and engine.interactions > MANY, by_building)
     split = (
@@ -296,7 +296,7 @@ def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
 
 
 def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Parameter and building of each constant in a chunk [c, 2], buildings hit by paths, and number of interactions."""
+    """Parameter and building of each constant in a chunk [c, 2], buildings on its paths, and number of interactions."""
     split = chunk.derived(splitting)
     return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
 

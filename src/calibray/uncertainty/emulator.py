@@ -319,7 +319,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with weight; if these are too many, mainly the best of them."""
+    """The calls with a path loss for every link with weight; if there are too many, mainly the best of them."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

@@ -62,7 +62,7 @@ class MissingRegion:
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses it; an estimate if not all links are used.
         share: Share of the mean square of the residuals that it explains.
-        chance: Median share that the best rectangle explains of permuted residuals.
+        chance: Median share of the mean square of permuted residuals that the best rectangle explains.
         significant: Whether at least `FEW` links cross it, and no permutation has a rectangle that explains as much.
     """
 

@@ -116,7 +116,7 @@ def fit_correlation(
     # The search is local, so it starts from the best of a few trials.
     start_ranges = np.quantile(log_ranges, (0.4, 0.6, 0.8))
     starts = [np.array([share, log_range]) for share in (0.3, 0.8) for log_range in start_ranges]
-    # BLAS threads cost more than they save on matrices of this size.
+    # BLAS threads cost more time than they save on matrices of this size.
     with single_blas_thread():
         bounds, first = (SHARES, tuple(log_ranges)), min(starts, key=cost)
         optimum = minimize(cost, first, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3})

@@ -25,8 +25,8 @@ SIZE: Final = (64, 256)
 """Smallest and largest number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
-"""Number of interactions that all populations together may evaluate. With a budget that is smaller by 10 %, the draws
-in Auckland correspond to 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Number of interactions that all populations together may evaluate. With a budget 10 % smaller, the draws in Auckland
+correspond to 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: the number of steps times the number of moves per step."""
@@ -188,7 +188,7 @@ def _together(populations: Sequence[Population]) -> Population:
 
 
 def _distance(model: JointModel, populations: list[Population]) -> float:
-    """Largest distance between the distribution functions of a study's parameter in two populations."""
+    """Largest distance between the distribution functions of any parameter of the study in two populations."""
     first, second = (each.point[:, : len(model.study)] for each in populations)
     distance = 0.0
     for one, other in zip(first.T, second.T, strict=True):

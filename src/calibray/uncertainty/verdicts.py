@@ -25,7 +25,7 @@ from calibray.uncertainty.draws import Draws, systematic_resampling
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
-    """Intervals by parameter from linear theory in the search space, where parameters over decades are logarithmic.
+    """Intervals by parameter from linear theory in the search space, which is logarithmic for some parameters.
 
     `optimum` is the evaluation at the optimum, with derivatives.
     """
@@ -332,7 +332,7 @@ def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axe
 
 
 def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
-    """Why most of the range fits although links depend on the parameter: trade-offs or large errors."""
+    """The reason why most of the range fits although links depend on the parameter: trade-offs or large errors."""
     drawn = draws.point[systematic_resampling(draws.weight, RANKED, np.random.default_rng(0))]
     # Spearman's correlation is that of the ranks.
     rank = np.argsort(np.argsort(drawn, axis=0), axis=0)
@@ -351,7 +351,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval; its verdict becomes ambiguous if it is identified but does not contain the calibrated value."""
+    """The interval; an identified verdict becomes ambiguous if the interval excludes the calibrated value."""
     identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
@@ -398,7 +398,7 @@ def _masses(
     total = np.cumsum(weight[order]) / weight.sum()
     index = np.searchsorted(total, (np.arange(QUANTILES) + 0.5) / QUANTILES)
     quantile = unit[order][np.minimum(index, len(unit) - 1)]
-    # A kernel is as wide as the range of a share of the draws, on the side where they are denser.
+    # A kernel is as wide as the range that a share of the draws spans, on the side where they are denser.
     near = round(QUANTILES * KERNEL_SHARE * min(1.0, (200.0 / independent) ** 0.2))
     above, below = np.full(QUANTILES, np.inf), np.full(QUANTILES, np.inf)
     above[:-near] = below[near:] = quantile[near:] - quantile[:-near]

@@ -56,13 +56,13 @@ def validate(
     """Compare models on held-out links: each block of links is left out in turn and predicted.
 
     Args:
-        study: The study, opened or not, with the engine "replay".
+        study: The study, with the engine "replay"; it may already be open.
         blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4 if
             the study states none.
         by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
         workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
         progress: Called with the name of each stage, the work done and the total.
-        tracer: Opens the scene in a ray tracer; an opened study has its own tracer.
+        tracer: Function that opens the scene in a ray tracer; not used for a study that is already open.
 
     Returns:
         Held-out errors of every model, with a table and a conclusion.
