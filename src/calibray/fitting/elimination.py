@@ -59,7 +59,7 @@ class Elimination:
     """Normal equations of a nuisance over weighted links.
 
     Attributes:
-        design: Columns Z of the nuisance at the m links with weight [m, q].
+        design: Columns Z of the nuisance at the m links with nonzero weight [m, q].
         weighted: Z' W, with the diagonal matrix W of the weights [q, m].
         data: Z' W Z, the normal equations without priors [q, q].
         normal: The normal equations with priors; `order` states the order of their columns.
@@ -112,9 +112,9 @@ class Elimination:
     def coefficients(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
         """The best coefficients [n, q], [dB] per unit of the column.
 
-        The gap is measured minus modelled path loss at the links with weight [n, m], [dB]. An undetermined coefficient
-        has the value nearest to 0 within its bounds, unless the bounds prevent the other coefficients from reaching the
-        minimum.
+        The gap is measured minus modelled path loss at the links with nonzero weight [n, m], [dB]. An undetermined
+        coefficient has the value nearest to 0 within its bounds, unless the bounds prevent the other coefficients from
+        reaching the minimum.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -142,7 +142,7 @@ class Elimination:
         """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for those at a bound.
 
         They are the negative derivatives of the best coefficients [n, q] with respect to the parameters. `slope`
-        contains the derivatives of the modelled path loss at the links with weight [n, m, d].
+        contains the derivatives of the modelled path loss at the links with nonzero weight [n, m, d].
         """
         if isinstance(self.weighted, np.ndarray):
             side = self.weighted @ slope
@@ -161,7 +161,7 @@ class Elimination:
         return projection
 
     def remove(self, slope: NDArray[np.float64], projection: NDArray[np.float64]) -> None:
-        """Subtract the projection [n, q, d] from derivatives at the links with weight [n, m, d], in place."""
+        """Subtract the projection [n, q, d] from derivatives at the links with nonzero weight [n, m, d], in place."""
         if isinstance(self.design, np.ndarray):
             slope -= self.design @ projection
             return

@@ -119,7 +119,7 @@ def traced_again(path_loss_db: NDArray[np.float64], gap: NDArray[np.float64]) ->
 
 
 def largest_gap(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
-    """Largest gap of the links with weight and a path in both traces [dB]; None if `gap` is None."""
+    """Largest gap of the links with nonzero weight and a path in both traces [dB]; None if `gap` is None."""
     if gap is None:
         return None
     return float(np.abs(gap[counted & np.isfinite(gap)]).max(initial=0.0))

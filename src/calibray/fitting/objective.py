@@ -176,7 +176,7 @@ class Objective:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """Mask of the columns that the links with weight determine [q].
+        """Mask of the columns that the links with nonzero weight determine [q].
 
         Examples of undetermined coefficients are the offset of a group without such links, or the slope of a group in
         which all links have the same distance.
@@ -238,12 +238,12 @@ class Objective:
     def value(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The minimised value [n], [dB]: the root mean square of all residuals, including the rows of priors.
 
-        It equals the RMSE if no coefficient has a prior. It is +inf if a link with weight has no path.
+        It equals the RMSE if no coefficient has a prior. It is +inf if a link with nonzero weight has no path.
         """
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 
     def rmse(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """RMSE [n], [dB], over the links only (paper eq. 1); +inf if a link with weight has no path."""
+        """RMSE [n], [dB], over the links only (paper eq. 1); +inf if a link with nonzero weight has no path."""
         links = self.residuals(path_loss)[:, : len(self._scale)]
         return np.sqrt(np.mean(links**2, axis=1))
 
@@ -291,7 +291,7 @@ class Objective:
 
     @property
     def num_rows(self) -> int:
-        """Number of residuals: links with weight, and coefficients with a prior."""
+        """Number of residuals: links with nonzero weight, and coefficients with a prior."""
         return self.num_counted + int(np.count_nonzero(self._ridge > 0))
 
     @property
@@ -304,7 +304,7 @@ class Objective:
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [L], [dB], plus the nuisance fitted to links with weight; other groups get the mean."""
+        """Path loss [L], [dB], plus the nuisance fitted to links with nonzero weight; other groups get the mean."""
         return self.capped(path_loss) + self.nuisance.contribution(self.completed(path_loss[None]))[0]
 
     def _model(
@@ -314,7 +314,7 @@ class Objective:
         return model + self.nuisance.contribution(coefficients) if self.nuisance.terms else model
 
     def _slopes(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Copy of the derivatives at the links with weight; 0 if the path loss is at the ceiling."""
+        """Copy of the derivatives at the links with nonzero weight; 0 if the path loss is at the ceiling."""
         at_ceiling = (path_loss >= (np.inf if self.ceiling_db is None else self.ceiling_db))[:, self._counted]
         slope = np.array(derivative[:, self._counted])
         slope[at_ceiling] = 0.0
@@ -322,7 +322,7 @@ class Objective:
 
     @cached_property
     def _counted(self) -> NDArray[np.int64] | slice:
-        """The links with weight; a slice if all links have weight, which avoids copies."""
+        """The links with nonzero weight; a slice if these are all links, which avoids copies."""
         counted = self.weight > 0
         return slice(None) if counted.all() else np.flatnonzero(counted)
 

@@ -57,7 +57,7 @@ class Observed:
     stated: bool
 
     def used(self, weight: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Indices of the links with a value and with weight [m]."""
+        """Indices of the links with a value and nonzero weight [m]."""
         return np.flatnonzero(np.isfinite(self.measured) & (weight > 0))
 
     def freedom(self, weight: NDArray[np.float64]) -> int:

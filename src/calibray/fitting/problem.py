@@ -178,12 +178,12 @@ class Problem:
         return self.evaluate_candidates(self.parameters.from_search(points), derivatives)
 
     def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """Like `evaluate`, but for candidates in the fields' units [n, d], without rounding errors of a conversion."""
+        """Like `evaluate`, but for candidates in physical units [n, d], without rounding errors of a conversion."""
         with_slopes = derivatives and self.differentiable
         answer = self.respond(candidates, with_slopes)
         evaluation = self.judge(candidates, answer)
         if with_slopes and answer.loss_slope is not None:
-            # Chain rule: from the fields' units to the search coordinates.
+            # Chain rule: from physical units to the search coordinates.
             unit = self.parameters.search_slope(candidates)
             further = (
                 None if answer.observed_slope is None else answer.observed_slope * unit[:, None, None, :]
@@ -193,14 +193,14 @@ class Problem:
         return evaluation
 
     def judge(self, candidates: NDArray[np.float64], answer: Responses) -> Evaluation:
-        """The evaluation, without derivatives, of candidates in the fields' units [n, d] from the engine's response."""
+        """The evaluation, without derivatives, of candidates in physical units [n, d] from the engine's response."""
         residuals = self.residuals(candidates, answer.path_loss, answer.observed)
         rmse_db = np.sqrt(np.mean(residuals[:, : self.objective.num_counted] ** 2, axis=1))
         value = np.sqrt(np.mean(residuals**2, axis=1))
         return Evaluation(value, residuals, None, answer.path_loss, rmse_db, observed=answer.observed)
 
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
-        """The engine's response to candidates in the fields' units [n, d]: the links' values and further observables.
+        """The engine's response to candidates in physical units [n, d]: the links' values and further observables.
 
         If derivatives are requested, the engine must provide them with respect to the parameters.
         """
@@ -283,7 +283,7 @@ class Problem:
     ) -> NDArray[np.float64]:
         """Weighted residuals [n, m]: of modelled values [n, L], of priors of parameters, then of further observables.
 
-        Candidates [n, d] are in the fields' units, and further observables [n, K, L] in SI units.
+        Candidates [n, d] are in physical units, and further observables [n, K, L] in SI units.
         """
         parts = [self.objective.residuals(modelled)]
         if len(self.priors):

@@ -45,7 +45,7 @@ DECAYED: Final = 4.0
 """Attenuation in a slab [Np] above which the slab acts as a half-space: the wave returns with e^-8 of its amplitude."""
 
 RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
-"""Ranges of the assumed constants, in the fields' units."""
+"""Ranges of the assumed constants, in physical units."""
 
 PERMITTIVITY_FACTOR: Final = 2.0
 """Largest factor between the study's value and the engine's value of a permittivity that is not calibrated."""

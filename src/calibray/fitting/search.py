@@ -151,7 +151,7 @@ class Trail:
     """The record of a search: every RT call in order, the best candidate, and the cost.
 
     Attributes:
-        candidates: The candidates in the fields' units, each [d].
+        candidates: The candidates in physical units, each [d].
         rmse_db: RMSE of each candidate [dB].
         best_db: RMSE of the best candidate up to each call [dB].
         iteration: Round of each call, counted from 1.
@@ -185,7 +185,7 @@ class Trail:
     def add(
         self, candidates: NDArray[np.float64], evaluation: Evaluation, iteration: int, seconds: float
     ) -> None:
-        """Record a round: candidates in the fields' units [n, d], its number from 1, and time since the start [s]."""
+        """Record a round: candidates in physical units [n, d], its number from 1, and time since the start [s]."""
         self.candidates += list(candidates)
         self.rmse_db += evaluation.rmse_db.tolist()
         self.iteration += [iteration] * len(evaluation.value)
@@ -195,7 +195,7 @@ class Trail:
             self.best_db.append(self.best_rmse_db)
 
     def compare(self, candidates: NDArray[np.float64], evaluation: Evaluation, row: int) -> None:
-        """Make one of the candidates in the fields' units [n, d] the best one if its objective is lower."""
+        """Make one of the candidates in physical units [n, d] the best one if its objective is lower."""
         if (value := float(evaluation.value[row])) < self.best_value:
             self.best, self.best_modelled = candidates[row], evaluation.modelled[row]
             self.best_value, self.best_rmse_db = value, float(evaluation.rmse_db[row])

@@ -398,7 +398,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
 
     Args:
         problem: The problem.
-        best: The best candidate, in the fields' units [d].
+        best: The best candidate, in physical units [d].
     """
     objective, links = problem.objective, problem.setup.links
     counted = np.flatnonzero(objective.weight > 0)
@@ -444,7 +444,7 @@ def _means(
 ) -> NDArray[np.float64]:
     """Values [L] with the mean of each link's known values in the link's first row; NaN if no value is known.
 
-    For each of the m rows with weight, `first` is the index of the first row of the same link [m].
+    For each of the m rows with nonzero weight, `first` is the index of the first row of the same link [m].
     """
     known = np.isfinite(values[counted])
     number = np.bincount(first[known], minlength=len(counted))

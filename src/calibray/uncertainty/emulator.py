@@ -84,7 +84,7 @@ class ConstantMean:
 
 @dataclass(frozen=True, eq=False)
 class ResponseRows:
-    """The emulated rows, which replace the residuals: path loss of links with weight, then further observables.
+    """The emulated rows, which replace the residuals: path loss of links with nonzero weight, then further observables.
 
     Further observables are divided by their errors and multiplied by that of path loss, so that all rows are
     comparable.
@@ -209,7 +209,7 @@ class EmulatedEngine:
             return Responses(*self._for_all_links(base + self.function.values(inputs), wanted))
         base, slope, inputs, change = self.mean.base_and_slope(unit)
         box, scale = self._box, self.parameters.search_slope(candidates)
-        # Derivatives with respect to the fields' values instead of the unit cube's coordinates.
+        # Derivatives with respect to the physical values instead of the unit cube's coordinates.
         slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
         links, last = self.rows.links, len(self.rows.links)
         loss_slope = np.zeros((count, len(self.initial_loss), box.dimension))
@@ -319,7 +319,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with weight; if there are too many, mainly the best of them."""
+    """The calls with a path loss for every link with nonzero weight; if there are too many, mainly the best of them."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

@@ -147,7 +147,7 @@ def fit_prediction_model(
 
 @dataclass(frozen=True, eq=False)
 class FittedVariant:
-    """A variant fitted to the links with a weight: parameters [d], objective, and path loss without nuisance [L]."""
+    """A variant fitted to the links with nonzero weight: parameters [d], objective, path loss without nuisance [L]."""
 
     candidate: NDArray[np.float64]
     objective: Objective
@@ -174,7 +174,7 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
 
 
 def fit_without_materials(problem: Problem, name: str) -> tuple[tuple[FittedTerm, ...], NDArray[np.float64]]:
-    """Terms of a log-distance model that is fitted to the links with a weight, and its path loss [L], [dB]."""
+    """Terms of a log-distance model that is fitted to the links with nonzero weight, and its path loss [L], [dB]."""
     study, links = problem.setup.study, problem.setup.links
     make = models.log_distance if name == Model.LOG_DISTANCE else models.obstructed
     model = make(links, problem.objective, models.without_scene(study, links))

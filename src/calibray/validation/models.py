@@ -80,7 +80,7 @@ def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]
 
 
 class Baseline(NamedTuple):
-    """A model without paths: all its unknowns are nuisance coefficients, which the links with a weight determine.
+    """A model without paths: all its unknowns are nuisance coefficients, which the links with nonzero weight determine.
 
     Attributes:
         objective: The model as an objective.
@@ -91,7 +91,7 @@ class Baseline(NamedTuple):
     known_db: NDArray[np.float64]
 
     def path_loss_db(self) -> NDArray[np.float64]:
-        """Path loss at all links [links], [dB]; a group without links with weight gets the mean of the others."""
+        """Path loss at all links [links], [dB]; groups without links of nonzero weight get the mean of the others."""
         return self.objective.with_nuisance(self.known_db)
 
 
@@ -160,7 +160,7 @@ def _free_name(by: str, terms: Sequence[Term]) -> str:
 
 
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss of a model at all links [links], [dB], plus its residuals kriged from the links with a weight.
+    """Path loss of a model at all links [links], [dB], plus its residuals kriged from the links with nonzero weight.
 
     The model was fitted to these links; its path loss is `trend_db` [links], [dB].
 
@@ -200,7 +200,7 @@ def kriged(
 
 
 def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.float64]]:
-    """Path loss at all links by each baseline without paths [links], [dB], fitted to the links with a weight."""
+    """Path loss at all links by each baseline without paths [links], [dB], fitted to the links with nonzero weight."""
     links, known_db = setup.links, without_scene(setup.study, setup.links)
     path_loss_db = {Model.LOG_DISTANCE: log_distance(links, objective, known_db).path_loss_db()}
     if has_obstruction(links):
@@ -234,7 +234,7 @@ NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 def fit_variants(
     part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
 ) -> dict[Model, tuple[Problem, NDArray[np.float64]]]:
-    """Fit every variant to the links with a weight.
+    """Fit every variant to the links with nonzero weight.
 
     Args:
         part: The problem; held-out links have weight 0.

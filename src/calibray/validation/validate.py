@@ -202,7 +202,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Path loss at all links by model [links], [dB]; the models are fitted to the links with a weight.
+    """Path loss at all links by model [links], [dB]; the models are fitted to the links with nonzero weight.
 
     Kriging is left out if it is impossible. `fits` contains the fitted variants that use the scene, from
     `fit_variants`.
