@@ -154,7 +154,7 @@ def path_losses(
             power = _link_power(program, response, combining)
         else:
             power = _link_power_of_steps(program, _split_by_step_wide(program, response), combining)
-        # Waits for this candidate, so that only one candidate's intermediate arrays are in memory.
+        # Wait for this candidate, so that only one candidate's intermediate arrays are in memory.
         powers.append(np.asarray(power))
         errors.append(error)
     return _stacked_losses(powers, len(tables)), np.stack(errors)

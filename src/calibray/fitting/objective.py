@@ -359,7 +359,7 @@ def make_objective(
         links: All links.
         reached: Mask of the links with a path [L].
         calibrated: Mask of the calibration links [L].
-        nuisance: The nuisance over all links; none if None.
+        nuisance: The nuisance over all links; if None, there is none.
         ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error [dB]; required if a coefficient has a prior.
 

@@ -4,8 +4,8 @@ The field of a path is a Jones vector. Each interaction has a frame for this vec
 n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT expresses the field in the basis
 (theta, phi) of the direction of travel. This module combines the rotation from one interaction's frame to this basis
 with the rotation from this basis to the next frame. The conventions are those of Sionna RT (reference near the poles,
-orientation of normals and wedges, mirrored instead of traced direction after a reflection), so that path gains also
-agree in phase.
+orientation of normals and wedges, mirrored instead of traced direction after a reflection), so path gains also agree in
+phase.
 """
 
 from __future__ import annotations

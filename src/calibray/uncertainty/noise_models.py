@@ -247,7 +247,7 @@ class Marginal:
             position: Positions of the links' ends [m, 3 or 6], [m].
             noise_db: Approximate noise level [dB].
             models: The noise models.
-            censored: Mask of the censored links [m]; none if None.
+            censored: Mask of the censored links [m]; if None, no link is censored.
             excess_db: Values of the function `excess_db` at these links [m], [dB]; None if no model is "out_of_sight".
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored

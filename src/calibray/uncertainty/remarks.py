@@ -37,8 +37,8 @@ SIGNIFICANT: Final = 0.005
 neighbouring links share make small probabilities slightly more frequent."""
 
 UNRELATED: Final = 0.02
-"""An observable is reported not to fit the scene if the probability of such a small slope under the model is below this
-value, divided by the number of observables."""
+"""An observable is reported as not fitting the scene if the probability of such a small slope under the model is below
+this value, divided by the number of observables."""
 
 FEWEST: Final = 5
 """Degrees of freedom below which no slope is tested."""

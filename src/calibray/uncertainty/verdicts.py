@@ -118,7 +118,7 @@ END: Final = 0.1
 link depends on the parameter."""
 
 TRADE_OFF: Final = 0.5
-"""Rank correlation above which another parameter is reported to compensate for a parameter."""
+"""Rank correlation above which one parameter is reported to compensate for another."""
 
 LARGE_EFFECT: Final = 3.0
 """Change of path loss, in standard deviations of the errors, above which a single link would determine the
@@ -157,7 +157,7 @@ REACH: Final = 8.5
 
 LEAST_GAP: Final = 0.03
 """A gap between pieces is attributed to chance if it is narrower than both this share of the range and the wider piece.
-Pieces that all lie within this share of the range are merged, because they represent one value to a user."""
+Pieces that all lie within this share of the range are merged, because a user would regard them as one value."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
