@@ -1,4 +1,4 @@
-"""Allow `python -m calibray` to be used if the command `calibray` is not on the search path."""
+"""Run the command line with `python -m calibray`, even if the command `calibray` is not on the search path."""
 
 from calibray.cli import main
 

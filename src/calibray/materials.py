@@ -29,7 +29,7 @@ def check_frequency(frequency: object, name: str = "frequency") -> float:
     """Check a carrier frequency [Hz] and convert it to a float; error messages call it `name`.
 
     Raises:
-        InputError: The frequency is not a number in the range `FREQUENCIES`.
+        InputError: The frequency is not a number within the limits `FREQUENCIES`.
 
     Example:
         >>> check_frequency(28_500_000_000)

@@ -59,7 +59,8 @@ wrong building heights, the errors of such predictions were up to 46 dB."""
 
 
 SAME_ANSWER_DB: Final = 0.01
-"""Largest difference between a program's answer for a calibration link and the stored one that is not a change [dB]."""
+"""Difference between a program's answer for a calibration link and the stored answer, above which Calibray warns
+[dB]."""
 
 
 def predict(
@@ -278,7 +279,7 @@ def interval(
     # Deviations are measured from the best value, so the difference between it and the mean of the draws is included.
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     factor, between = _quantiles(model, level)
-    # `factor` multiplies everything below, but the spread of groups needs the quantile of blocks, `between` times it.
+    # The interval is scaled by `factor`, the quantile for links; `between` converts it to the quantile for blocks.
     variance = (between * shift.spread_db) ** 2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
     basis = model.basis
@@ -363,8 +364,8 @@ def _replay(
     """The engine for opened links, with the values of the prediction model and of every draw; None without a scene.
 
     A program is called for the values of the prediction model, and for both sets of values of an average, because the
-    replay of another ray tracer has different antennas and physics. The replay provides the change in path loss for
-    each draw.
+    program may differ from the replay in antennas and physics. The replay provides the change in path loss for each
+    draw.
     """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
@@ -404,8 +405,9 @@ def _replay(
 def _with_calibration_link(result: Record, setup: Setup) -> tuple[Setup, NDArray[np.float64]]:
     """The opened study with one calibration link after the new links, and this link's stored path loss [1], [dB].
 
-    It is the weakest link with a path, because weak links depend on most parts of a program. If the engine is not a
-    program, or no such link has a carrier of the new links, the setup is unchanged, and nothing is stored [0].
+    The weakest link with a path is used, because the path loss of weak links depends on most parts of a program. If the
+    engine is not a program, or no such link has a carrier of the new links, the setup is unchanged, and there is no
+    stored path loss [0].
     """
     links, ends, table = setup.links, result.ends, result.links
     stored_db = table["scene_db"].to_numpy(float)

@@ -57,7 +57,7 @@ MOST_DRAWS: Final = 96
 """Largest number of posterior draws that are used to rank the candidates."""
 
 VALUES_PER_RANGE: Final = 24
-"""Number of further values in each separate range of a parameter, because some ranges contain few draws."""
+"""Number of values that are added in each separate range of a parameter, because some ranges contain few draws."""
 
 LEAST_GAIN: Final = 0.02
 """Smallest relative narrowing of an interval, and smallest gain in probability, that are reported as text."""
@@ -76,9 +76,9 @@ def suggest(
 
     Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
     measurement adds no information. If they differ by more than the error of a link, a measurement rules out some
-    draws. Candidates are chosen one at a time, each as the best addition to the earlier ones. Candidates with a mean
-    predicted power too near the study's noise floor, which a calibration would leave out, are left out. A warning in
-    the log states their number and the required margin.
+    draws. Candidates are chosen one at a time, each as the best addition to the earlier ones. Candidates are left out
+    if a calibration would leave them out because their mean predicted power is too near the study's noise floor. A
+    warning in the log states their number and the required margin.
 
     Args:
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
@@ -267,9 +267,9 @@ class _ReplayedDraws:
     def floor_margin_db(self) -> float:
         """Distance from the noise floor within which a calibration leaves out a link by its predicted path loss [dB].
 
-        It is that of `leave_out_near_floor`, or the smallest distance of a calibrated link if the calibration used a
-        smaller one. It is 0 without a noise floor. It is also 0 with censored links, because the draws then use links
-        near the floor.
+        The margin is that of `leave_out_near_floor`, or the smallest distance of a calibrated link from the floor if
+        that is smaller. The margin is 0 without a noise floor, and with censored links, because the draws then use
+        links near the floor.
         """
         links, counted = self.problem.setup.links, self.problem.objective.weight > 0
         if links.limit_db is None or links.censored is not None:

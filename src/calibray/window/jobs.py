@@ -213,7 +213,7 @@ class Stage:
 
 
 def stages(log: str) -> list[Stage]:
-    r"""The stages in a log, in order; stages of less than a few seconds print no progress line and are missing.
+    r"""The stages in a log, in order; stages shorter than a few seconds print no progress line and are missing.
 
     Example:
         >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")

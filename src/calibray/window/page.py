@@ -43,7 +43,7 @@ def build(desk: Desk) -> None:
     def activity() -> None:
         _activity(desk, progress)
 
-    # Other tabs show what this one will show, so that no tab redraws the steps of all tabs soon after.
+    # Redraw all tabs now if the content has changed; otherwise a tab would soon redraw the steps of all tabs.
     if _contents(desk) != desk.drawn:
         _redraw(desk)
     ui.colors(primary="#1f5fa8", negative="#a11d1d", positive="#1d6b3a", info="#1f5fa8")
