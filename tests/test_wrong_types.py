@@ -186,11 +186,11 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
     refused(r"not a pandas\.DataFrame; use read_measurements", lambda: cb.trace(study, table))
     for frequency in ("3e9", 3.5):
         refused(
-            f"frequency = {frequency!r}: must be in .* write 28.5 GHz as 28.5e9",
+            f"frequency = {frequency!r}: must be from .* write 28.5 GHz as 28.5e9",
             lambda frequency=frequency: cb.itu_material("concrete", frequency),
         )
     refused("conductivity: follows from ITU-R", lambda: cb.itu_material("concrete", 3e9, conductivity=1.0))
-    refused("frequency = '3e9': must be in 1e", lambda: paths.at("3e9"))
+    refused("frequency = '3e9': must be from 1e", lambda: paths.at("3e9"))
     name = next(iter(paths.materials))
     refused(f"material '{name}': is 5, must be a Material", lambda: cb.path_loss(paths, {name: 5}))
 

@@ -40,7 +40,7 @@ def check_frequency(frequency: object, name: str = "frequency") -> float:
         isinstance(frequency, Real) and lowest <= float(frequency) <= highest
     ):
         raise InputError(
-            f"{name} = {frequency!r}: must be in {lowest:g} to {highest:g} Hz; write 28.5 GHz as 28.5e9"
+            f"{name} = {frequency!r}: must be from {lowest:g} to {highest:g} Hz; write 28.5 GHz as 28.5e9"
         )
     return float(frequency)
 

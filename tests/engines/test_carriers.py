@@ -187,7 +187,7 @@ def test_paths_of_some_links_are_theirs_in_any_order(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0.0,), r"frequency = 0\.0: must be in 1e\+06 to 1e\+12 Hz"),
+        ((0.0,), r"frequency = 0\.0: must be from 1e\+06 to 1e\+12 Hz"),
         ((28.5,), r"frequency = 28\.5: .*write 28\.5 GHz as 28\.5e9"),
         ((float("nan"),), "frequency = nan"),
         ((1e9, {"glass": None}), "no material 'glass' in the traced scene, which has soil, walls"),

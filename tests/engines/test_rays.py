@@ -504,8 +504,8 @@ def test_antennas_of_a_study_are_those_of_the_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"frequency": "3.5e9"}, "frequency = '3.5e9': must be in 1e"),
-        ({"frequency": 3.5}, "frequency = 3.5: must be in 1e"),
+        ({"frequency": "3.5e9"}, "frequency = '3.5e9': must be from 1e"),
+        ({"frequency": 3.5}, "frequency = 3.5: must be from 1e"),
         ({"antennas": ("iso", "iso")}, "must be two Antenna"),
         ({"tx_power_dbm": 30.0}, "applies only to Wireless InSite files"),
     ],

@@ -442,7 +442,7 @@ def test_paths_without_a_calibrated_material_do_not_show_that_the_model_represen
     assert mapped.reached
     assert not mapped.understood
     text = remark_text(ray_mapping._remark(mapped))
-    assert text.startswith("No path of the program meets a calibrated material")
+    assert text.startswith("No path of the program interacts with a calibrated material")
 
 
 def test_a_candidate_that_is_asked_twice_is_one_call(foreign: Foreign) -> None:

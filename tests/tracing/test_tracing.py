@@ -336,7 +336,7 @@ def test_invalid_positions_are_refused(house: Tracer, tx: list, rx: list, messag
         ({"refraction": "no"}, r"trace\.refraction = 'no': must be true or false"),
         ({"diffraction": 1}, r"trace\.diffraction = 1: must be true or false"),
         ({"frequency": 0.0}, r"frequency = 0\.0: must be"),
-        ({"frequency": 3.5}, r"frequency = 3\.5: must be in 1e\+06 to 1e\+12 Hz"),
+        ({"frequency": 3.5}, r"frequency = 3\.5: must be from 1e\+06 to 1e\+12 Hz"),
         ({"frequency": -1e9}, r"frequency = -1000000000\.0: must be"),
         ({"frequency": float("nan")}, r"frequency = nan: must be"),
         ({"tx_antenna": {"pattern": "yagi"}}, r"antenna pattern = 'yagi': must be one of iso, dipole"),

@@ -67,8 +67,8 @@ def predict_links(
 ) -> pd.DataFrame:
     """Predict path loss, intervals and remarks, in this process or on workers.
 
-    The result is the table of `interval` with a column `remark`, which is empty for links without a remark. It is empty
-    for all links if `with_remarks` is False. The stage of `progress` is "tracing".
+    The result is the table of `interval` with a column `remark`, which is empty for links without a remark, and for all
+    links if `with_remarks` is False. The stage of `progress` is "tracing".
 
     Raises:
         InputError: `interval` refuses the input.

@@ -31,7 +31,7 @@ draws has an error of 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine for new links, and the parameter values of the prediction model, then of every draw [1 + draws, d].
+    """An engine for new links, and parameter values: those of the prediction model, then of every draw [1 + draws, d].
 
     If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2. `answers` is the
     path loss that an external program returns for the values before the draws [averaged, links], [dB].

@@ -322,7 +322,7 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
     """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales the blocks' part.
 
     Farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a factor of
-    up to two. Such a distant position differs from the blocks as much as the blocks differ from each other. The
+    up to two. Such a distant position may differ from the blocks as much as the blocks differ from each other. The
     contribution of random effects to these errors is subtracted, because `nuisance_shift` adds their spread for links
     of a new group.
     """

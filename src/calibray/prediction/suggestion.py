@@ -173,9 +173,9 @@ def _received(
     reached: NDArray[np.int64],
     margin_db: float,
 ) -> NDArray[np.int64]:
-    """The candidates among `reached`, which have a path, with a predicted power above the noise floor by the margin.
+    """The candidates of `reached`, which have a path, whose predicted power exceeds the noise floor by the margin.
 
-    All remain if the study has no noise floor, or if the transmitted power of the candidates is unknown.
+    All of `reached` is returned if the study has no noise floor, or if the candidates' transmitted power is unknown.
 
     Raises:
         InputError: No candidate has enough predicted power.

@@ -167,7 +167,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
 
 @lru_cache(maxsize=4)
 def _searched(rows: bytes) -> MissingRegion | None:
-    """The region found from rows of both ends, excess loss and obstruction; cached, because a report uses it twice."""
+    """The missing region, cached for a second use; each of `rows` has a link's ends, excess loss and obstruction."""
     links = np.frombuffer(rows).reshape(-1, 8)
     return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 

@@ -326,7 +326,7 @@ def _worst(result: Record, links: Survey | None) -> Table:
 
 
 def _held_out(result: Record) -> list[str]:
-    """Whether each link was held out: always, in turn, or never."""
+    """How each link was held out: "yes" (always), "in turn" or "no"."""
     blocks = np.zeros(len(result.links), bool) if result.held_out is None else result.held_out.block >= 0
     always = result.links["held_out"].to_numpy(bool)
     return np.select([always, blocks], ["yes", "in turn"], "no").tolist()

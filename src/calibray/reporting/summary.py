@@ -45,7 +45,7 @@ class Sentence:
     Attributes:
         heading: The question that the sentence answers; empty if it continues the previous answer.
         text: The answer.
-        kind: Whether the answer is neutral, favourable, or a caution.
+        kind: The kind of answer: neutral, favourable, or a caution.
     """
 
     heading: str

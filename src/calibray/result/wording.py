@@ -279,8 +279,8 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     # Records of earlier versions lack this value.
     if not values.get("meets_calibrated", True):
         return (
-            f"No path of the program meets a calibrated material, so its {values['calls']} calls show neither these "
-            "materials nor whether the model represents the program. Calibrate materials on the paths, or check them."
+            f"No path of the program interacts with a calibrated material, so its {values['calls']} calls do not show "
+            "whether the model represents the program. Calibrate materials on the paths, or check the paths."
         )
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
