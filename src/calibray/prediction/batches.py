@@ -30,10 +30,10 @@ from calibray.support.progress import Progress, with_total
 from calibray.tracing.trace_plan import LANES_PER_SECOND
 
 BATCH: Final = 10_000
-"""Number of links that are traced and evaluated together."""
+"""Largest number of links that are traced and evaluated together."""
 
 DIFFUSE_BATCH: Final = 50
-"""The same number with diffuse reflection, which produces tens of thousands of paths per link."""
+"""The same limit with diffuse reflection, which produces tens of thousands of paths per link."""
 
 CHUNKS_PER_BATCH: Final = 100
 """Number of chunks that are sent to the workers together."""

@@ -125,7 +125,7 @@ def coverage_map(
         low, high = triangles.vertex.min(axis=0)[:2], triangles.vertex.max(axis=0)[:2]
         if beyond := int(((rx[:, :2] < low) | (rx[:, :2] > high)).any(axis=1).sum()):
             _LOG.warning(
-                "%d of %d cells are outside the scene, which has no buildings there; give smaller bounds",
+                "%d of %d cells are outside the scene, where no buildings are known; give smaller bounds",
                 beyond,
                 len(rx),
             )

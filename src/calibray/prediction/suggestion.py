@@ -466,8 +466,8 @@ def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
 def _width(result: Record, name: str, narrowed: float) -> float:
     """Width of a parameter's interval if the draws are narrowed by a factor, on the scale of the search.
 
-    The draws refer to the buildings that the links' paths meet. A measurement does not show how much other buildings
-    differ, so this part of the width remains.
+    The draws apply to the buildings on the links' paths. A measurement does not show how much other buildings differ,
+    so this part of the width remains.
     """
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)

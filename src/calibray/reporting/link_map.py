@@ -155,7 +155,7 @@ def ramp_limit(value: NDArray[np.float64]) -> float:
 
 
 def _round(value: float, up: bool = False) -> float:
-    """The nearest number of the series 1, 2, 5, 10, ... below a value, or above it."""
+    """The largest number of the series 1, 2, 5, 10, ... up to a value or, with `up`, the smallest from the value on."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
     # A rounding error above a step must not lead to the next one.
@@ -174,7 +174,7 @@ def _buildings(triangles: Triangles, layout: Plan) -> str:
 
 
 def _outlines(region: Region, layout: Plan) -> str:
-    """Outline of the union of a region's polygons, simplified to one map unit."""
+    """Outline of the union of a region's polygons, simplified with a tolerance of one map unit."""
     shapely = library("shapely", "scenes")
     parts = shapely.get_parts(shapely.simplify(shapely.union_all(region.outline), 1 / layout.scale))
     lines = [layout.project(shapely.get_coordinates(ring)).round(1) for ring in shapely.get_rings(parts)]

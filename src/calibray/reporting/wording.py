@@ -24,7 +24,7 @@ from calibray.uncertainty.verdicts import TRADE_OFF
 
 
 def prediction_text(record: Record) -> str:
-    """The prediction model, described in one or two sentences."""
+    """The prediction model, described in at most three sentences."""
     model = record.prediction.model
     if model.parameters is None:
         source = _unused(record)
@@ -81,7 +81,7 @@ def group_text(record: Record, label: str) -> str:
 def scene_alone_text(record: Record) -> str:
     """The difference between the exported scene alone and the predictions.
 
-    The text has one or two sentences, and is empty if the scene alone reproduces the predictions.
+    The text has at most three sentences, and is empty if the scene alone reproduces the predictions.
     """
     links, model = record.links, record.prediction.model
     scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))

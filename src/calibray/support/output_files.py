@@ -245,7 +245,7 @@ def _refuse_signature_file(path: Path, fault: str) -> NoReturn:
 
 
 def _signature(file: Path, name: str) -> str:
-    """The signature line of a file; line breaks in its name are escaped."""
+    """The signature line of a file; unprintable characters in its name are escaped."""
     return f"{file_digest(file)}  {name if name.isprintable() else ascii(name)}"
 
 
@@ -264,7 +264,7 @@ HDF5_METADATA: Final = 2**16  # generous size of an HDF5 file without its datase
 def check_space(partial: Path, size: int) -> None:
     """Raise an error if an HDF5 file with datasets of a given size [bytes] does not fit on its disk.
 
-    On a full disk, the HDF5 library prints errors that cannot be caught, and may crash the process at its end.
+    On a full disk, the HDF5 library prints errors that cannot be caught, and may crash the process when it exits.
 
     Raises:
         OSError: The disk has too little free space.

@@ -101,7 +101,8 @@ class Jobs:
                     start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
             created = psutil.Process(child.pid).create_time()
-            # Without a wait, the ended process would stay in the process table, where the look-up above still needs it.
+            # Without a wait, the ended process would stay in the process table. The look-up above precedes the wait,
+            # because it would fail afterwards.
             Thread(target=child.wait, daemon=True).start()
             record = {"words": list(words), "pid": child.pid, "created": created}
             write_text(Path(f"{stem}.json"), json.dumps(record) + "\n")
@@ -138,7 +139,7 @@ class Jobs:
                 os.killpg(job.pid, signal.SIGINT)
 
     def wait(self, job: Job, seconds: float) -> Job:
-        """Wait until a command ends, for at most the given number of seconds, and return its current state."""
+        """Wait for a command for at most the given number of seconds; return it with its final state, or unchanged."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             now = next(other for other in self.list() if other.number == job.number)
