@@ -7,9 +7,9 @@ greedily until the fit is accurate enough (C. Farhat, T. Chapman, P. Avery, Int.
 1077).
 
 Weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
-training candidates. The error is nevertheless checked at new candidates, many of them on faces of the bounds. If a
-link's error there exceeds half the tolerance, the link is fitted again to more candidates. After several failed fits,
-it keeps all its paths.
+training candidates. The error is nevertheless checked at new candidates, many of which have parameters at their bounds.
+If a link's error there exceeds half the tolerance, the link is fitted again to more candidates. After several failed
+fits, it keeps all its paths.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TOLERANCE_DB: Final = 0.01
 """Default tolerance for the error in a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
-"""A link with fewer paths is not compressed, because the gain would be small."""
+"""A link with at most this many paths is not compressed, because the gain would be small."""
 
 FIT_SHARE: Final = 0.1
 """Share of the tolerance that the fit may use; the rest allows for candidates between the training candidates."""
@@ -198,7 +198,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Batches of links, such that the powers of a batch's paths in the pool fit into memory."""
+    """Divide links into batches such that the powers of a batch's paths in the pool fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
@@ -226,10 +226,10 @@ class _Powers:
 def _fit_link(
     powers: _Powers, paths: slice, totals: list[NDArray[np.float64]], tolerance_db: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Weights of a link's paths in the pool, and the largest error at new candidates; None if the error is too large.
+    """Weights of a link's paths in the pool, and the largest error at new candidates; None if no fit is accurate.
 
-    Candidates at which the link has no power, for instance because nothing scatters, are omitted, because weights
-    cannot change a zero.
+    Weights cannot change a power of zero, so candidates at which the link has no power are omitted, for instance if
+    nothing scatters.
     """
     # Largest relative error of a power, converted from decibels.
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10

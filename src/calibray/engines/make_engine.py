@@ -42,7 +42,7 @@ def make(
         progress: Called after every launch of a trace ("tracing") or after every RT call of a batch ("running").
         ledger: SQLite file that stores RT calls. Replay does not use it, because replaying is faster than reading the
             file.
-        workers: Workers that run the calls of a batch for "command", or keep chunks of links for "replay".
+        workers: Workers that run the calls of a batch ("command") or hold chunks of links ("replay").
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
     Returns:
@@ -79,7 +79,7 @@ def fingerprint(study: OpenedStudy) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
     The method, seed, measured values, bounds and start values are excluded, so studies that differ only in these share
-    their calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is
+    stored calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is
     unknown, so its command line is included instead.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
@@ -133,7 +133,7 @@ def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[
 
 
 def _geometry(scene: Scene) -> bytes:
-    """The scene's XML without material constants, because the fingerprint must not include calibrated constants."""
+    """The scene's XML without material constants, some of which are calibrated and belong to the candidate."""
     root = ElementTree.fromstring(scene.xml)
     for constants in root.findall("bsdf"):
         root.remove(constants)

@@ -71,7 +71,7 @@ class ProcessOwner:
 
     @property
     def is_gone(self) -> bool:
-        """Whether the process is known to have ended; processes of other machines or containers are not checked."""
+        """Whether the process is known to have ended; False on another machine or in another container."""
         if (self.host, self.namespace) != _machine():
             return False
         if self.boot != _boot():

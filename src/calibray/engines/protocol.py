@@ -1,4 +1,4 @@
-"""The interfaces of engines, their answers, the check of candidates, and observables."""
+"""The interfaces of engines and observables, the answers of engines, and the check of candidates."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """Make a function of candidates that reduces every chunk's path loss on its worker and returns little data.
+        """Make a function of candidates that reduces each chunk's path loss on its worker, so that little data is sent.
 
         Every chunk has one reduction, which is sent to its worker once.
         """
@@ -160,7 +160,7 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def derived(self, parameters: Parameters, derive: Callable[[Any], Differentiable]) -> Chunked:
-        """The same chunks with engines for other parameters, which the picklable function `derive` makes."""
+        """The same chunks for other parameters; the picklable function `derive` makes their engines."""
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
@@ -170,7 +170,7 @@ class Chunked(Differentiable, Protocol):
 
 @runtime_checkable
 class ReplaysScene(Protocol):
-    """An engine on stored paths that can omit the effects that an exported scene does not contain."""
+    """An engine on stored paths that can leave out effects, which an exported scene does not contain."""
 
     def scene_path_loss(
         self, candidates: NDArray[np.float64], walls: Mapping[str, str]
@@ -191,7 +191,7 @@ class Answer:
         index: Index of the candidate in the batch.
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
         seconds: Duration of the call [s].
-        failure: Error message with engine and candidate; empty if the call succeeded.
+        failure: Error message that names the engine and the candidate; empty if the call succeeded.
         rays: The unchanged response of a program that returns rays, or further observables [K, L] in SI units as
             little-endian doubles; empty if there are neither rays nor observables.
         lost: Whether the call failed because its worker or guard ended, which is not the program's fault. The ledger
@@ -269,7 +269,7 @@ def gather_responses(
 
 
 def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Convert candidates [n, d] to an array, and refuse candidates that cannot be evaluated.
+    """Check candidates [n, d], and return them as an array of floats.
 
     Raises:
         InputError: The shape is wrong, or a value is not a finite real number.

@@ -19,7 +19,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 MOST_DERIVATIVES: Final = 2_000_000
-"""Largest number of derivatives with respect to material constants in one call; more would fill the memory."""
+"""Largest number of derivatives with respect to material constants in one call, which limits memory use."""
 
 MAY_TABULATE: Final = 30_000
 """Number of interactions above which coefficients can be taken from tables."""
@@ -90,7 +90,7 @@ class Replay:
         self._dtype, self._batch = dtype, computation.batch
         self._combining = fields.Combining.make(combining, paths.link, paths.delay, bandwidth)
         # Row (material) and column (constant) of each parameter in the table of constants. Derivatives are computed for
-        # the columns that occur, and then picked for each parameter.
+        # the columns that occur, and then assigned to parameters.
         self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
         used_columns, self._used_column = np.unique(self._columns, return_inverse=True)
         self._used_columns = tuple(int(column) for column in used_columns)
@@ -155,7 +155,7 @@ class Replay:
         if self._combining.kind == "power":
             self.calls += len(values)
             return responses
-        # Other combinations need more than the powers of paths; the functions below count the candidates.
+        # Other ways of combining need more than the powers of paths; the methods below count the candidates.
         if not derivatives:
             return replace(responses, path_loss=self.path_loss(candidates))
         loss, slope = self.path_loss_and_jacobian(candidates)
@@ -168,7 +168,7 @@ class Replay:
 
     @cached_property
     def _channel(self) -> fields.Channel:
-        """The paths in the form that is needed to compute further observables."""
+        """The paths in the form required to compute further observables."""
         plan = fields.layout(self.paths)
         return fields.Channel(
             plan.program,
@@ -242,13 +242,13 @@ class Replay:
     def _arguments(
         self, base: NDArray[np.floating], batch: NDArray[np.floating], size: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Material constants [size, M, 8] and values of effects [size, e] of a batch.
+        """Material constants [size, M, 8] and effect parameters [size, e] of a batch.
 
         The program is compiled for `size` candidates; unused rows of the tables have the base values.
         """
         tables = np.repeat(base[None], size, axis=0)
         tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
-        # Unused rows of the effects repeat values of the batch; answers for unused rows are dropped.
+        # Unused rows of effect parameters repeat values of the batch; answers for unused rows are dropped.
         of_effects = np.resize(batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects)))
         return tables, of_effects
 

@@ -67,7 +67,7 @@ class OpenedStudy(Protocol):
 
     @property
     def carriers(self) -> Mapping[float, Mapping[str, Material]]:
-        """Materials before calibration by carrier [Hz]; empty if all links have the study's carrier."""
+        """Materials before calibration, by carrier [Hz]; empty if all links have the study's carrier."""
         ...
 
     @property
@@ -102,7 +102,7 @@ class OpenedStudy(Protocol):
 
     @property
     def tracer_versions(self) -> Mapping[str, str]:
-        """Versions of the ray tracer's parts by name."""
+        """Versions of the ray tracer's parts, by name."""
         ...
 
     def tracer_at(self, frequency: float) -> Tracer:
@@ -149,8 +149,8 @@ class EngineSection(Section, ABC):
 
     Attributes:
         name: The kind's name in study files.
-        expensive: Whether a call takes longer than reading a stored answer, so that a ledger stores the calls.
-        external: Whether an external program computes the answers, so that no ray tracer is needed.
+        expensive: Whether a call takes longer than reading a stored answer; a ledger then stores the calls.
+        external: Whether an external program computes the answers and no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
     """
 
@@ -161,7 +161,7 @@ class EngineSection(Section, ABC):
 
     @property
     def exports_rays(self) -> bool:
-        """Whether an external program returns rays, so that a replay can replace it."""
+        """Whether an external program returns rays, from which a replay can be made."""
         return self.external and getattr(self, "rays", False) is True
 
     @abstractmethod

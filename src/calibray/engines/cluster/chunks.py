@@ -48,8 +48,8 @@ CHUNK_LINKS: Final = 1000
 """Default limit of the links per chunk; it is raised if there would otherwise be more than `MOST_CHUNKS` chunks."""
 
 MOST_CHUNKS: Final = 64
-"""Largest number of chunks if the study does not set their size. The number is limited because every chunk compiles its
-own program.
+"""Largest number of chunks if the study does not state their size. The number is limited because every chunk compiles
+its own program.
 """
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
@@ -147,12 +147,12 @@ def chunk_size(stated: int | None, count: int) -> int:
 
 
 def stated_chunk_size(study: OpenedStudy) -> int | None:
-    """The number of links per chunk stated in a study; None if there is none."""
+    """The number of links per chunk stated in a study, or None."""
     return getattr(study.engine, "chunk_links", None)
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Divide links into about equal chunks of at most `size` links, so that rays start at few positions in each chunk.
+    """Divide links into chunks of at most `size` links, nearly equal in size, whose rays start at few positions.
 
     Returns the indices of every chunk's links, in ascending order.
 
@@ -193,7 +193,7 @@ def trace_in_chunks(
         EngineError: The paths do not fit into memory, or workers die repeatedly.
     """
     links, size = study.links, chunk_size(stated_chunk_size(study), len(study.links))
-    # Every chunk brings its own links, so the shared study is sent with only one link.
+    # Every chunk has its own links, so the shared study is sent with only one link.
     one_link = study.at(select_links(links, np.array([0])))
     answers = for_each_chunk(workers, partial(_trace_chunk, check), one_link, links, size, progress)
     paths = join_links([(chunk, chunk_paths) for chunk, (chunk_paths, _) in answers])

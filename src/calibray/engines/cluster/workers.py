@@ -119,7 +119,7 @@ class InProcess:
     def _has_room(self, kept: int) -> bool:
         if self._at_most is not None:
             return kept < self._at_most
-        # Without a cache folder, a chunk that is not kept would be traced again for each question.
+        # Without a cache folder, a chunk that is not kept would have to be traced again for each question.
         return cache_folder() is None or available_memory() > self._reserve
 
 
@@ -177,7 +177,7 @@ class _KeptInProcesses:
 
 @dataclass(eq=False)
 class _Worker:
-    """A process with its pipe, the keys of the objects that it has made, and its current chunk."""
+    """A process with its pipe, the keys of the objects that it holds, and its current chunk."""
 
     process: SpawnProcess
     pipe: Connection
@@ -397,7 +397,7 @@ def check_workers(workers: object) -> None:
     """Refuse anything but workers or None.
 
     Raises:
-        InputError: It is something else, such as a number.
+        InputError: The argument is something else, such as a number.
     """
     if not isinstance(workers, Workers | None):
         raise InputError(
@@ -434,8 +434,8 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
             client = opened.enter_context(scheduler_client(scheduler))
             yield DaskWorkers(lambda: client, lambda: client.get_executor(pure=False))
         elif workers is not None:
-            # Processes and threads start on first use, because an engine needs only one of these kinds. Each thread
-            # runs one external program at a time.
+            # Processes and threads start on first use, because an engine needs only one of the two. Each thread runs
+            # one external program at a time.
             local = LocalWorkers(workers, lambda: opened.enter_context(ThreadPoolExecutor(workers)))
             opened.callback(local.close)
             yield local

@@ -27,7 +27,7 @@ if __name__ == "__main__":
 
 HEAD, TAIL = 500, 1500  # bytes that are kept from the start and the end of an output
 KILL_TIME = 5.0  # longest time to keep killing processes [s]
-POLL = 0.5  # interval between checks that Calibray is still alive and, in Calibray, whether to stop [s]
+POLL = 0.5  # interval between checks: the guard, whether Calibray is alive; Calibray, whether to stop [s]
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
 
@@ -45,7 +45,7 @@ class Output:
         self.tail = (self.tail + part[-TAIL:])[-TAIL:]
 
     def text(self) -> str:
-        """The output as text, without a long middle; control characters, which can harm terminals, are replaced."""
+        """The output as text, shortened in the middle; control characters, which can harm terminals, are replaced."""
         left_out = self.length - len(self.head) - len(self.tail)
         middle = f" ... ({left_out} bytes omitted) ... ".encode() if left_out else b""
         text = (self.head + middle + self.tail).decode("utf-8", "replace").replace("\r\n", "\n").strip()
@@ -145,7 +145,7 @@ def _kill_tree(process: subprocess.Popen) -> None:
             with suppress(psutil.Error):
                 descendant.kill()
         psutil.wait_procs(descendants, timeout=0.01)
-        # Processes may have started others meanwhile, and this process has adopted the children of those it killed.
+        # Processes may have started others since, and this process has adopted the children of those it killed.
         descendants = guard.children(recursive=True)
 
 

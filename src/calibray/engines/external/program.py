@@ -79,7 +79,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """Settings for calls of an external program; picklable, so that the program can be called on other machines.
+    """An external program with the settings of its calls; picklable, for calls on other machines.
 
     Attributes:
         words: The program and its arguments. The paths of the files replace `{request}` and `{response}`; a path whose

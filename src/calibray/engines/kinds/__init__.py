@@ -28,7 +28,7 @@ def _sections() -> dict[str, type[EngineSection]]:
 
 
 KINDS: Final = _sections()
-"""The sections of all kinds of engines by name."""
+"""The sections of all kinds of engines, by name."""
 
 DEFAULT: Final = "replay"
 """The kind that a study without ``[engine]`` uses."""

@@ -1,4 +1,4 @@
-"""Command: an external program computes path loss for every candidate, sequentially or in parallel."""
+"""Command: an external program computes path loss for candidates, one at a time or in parallel."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class CommandSection(EngineSection):
         return self
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
-        """The program, its arguments, and "rays" if it returns rays; the program's version is unknown."""
+        """The command line, and "rays" if the program returns rays; the program's version is unknown."""
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
@@ -92,12 +92,12 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only this candidate is lost: its links are treated as links without a path. The run
-    ends if every candidate of the first batch fails or many successive calls fail, because the fault is then probably
-    in the program.
+    If all attempts of a call fail, only this candidate is lost: all links count as links without a path. The run ends
+    if every candidate of the first batch fails or if `give_up_after` successive calls fail, because the fault is then
+    probably in the program.
 
     Args:
-        program: Settings for calls of the program.
+        program: The program, with the settings of its calls.
         study: The opened study.
         give_up_after: Number of successive failed calls after which the run ends.
         executor: Executor for the calls of a batch; if None, calls run sequentially.

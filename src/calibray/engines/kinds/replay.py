@@ -38,9 +38,9 @@ class ReplaySection(EngineSection):
         compress_db: Largest error in path loss when a few weighted paths replace all paths [dB]; None to replay all
             paths.
         chunk_links: Largest number of links that are traced and replayed together. If None, all links are traced
-            together. With workers, the default is `chunks.CHUNK_LINKS`, or more if there would otherwise be over
+            together. With workers, the default is `chunks.CHUNK_LINKS`, or more if there would otherwise be more than
             `chunks.MOST_CHUNKS` chunks.
-        rays: Ray table with the paths of another engine, which are used instead of a trace.
+        rays: Ray table with the paths of another engine, to be used instead of a trace.
     """
 
     expensive: ClassVar[bool] = False
@@ -65,7 +65,7 @@ class ReplaySection(EngineSection):
         Raises:
             InputError: The study does not allow compression, or its links cannot be traced.
         """
-        # Refuse before anything is traced.
+        # An unsuitable study is refused before anything is traced.
         self._check_compressible(study)
         if paths is None and (workers is not None or self.chunk_links is not None):
             return self._chunked(study, progress, workers)
@@ -107,7 +107,7 @@ class ReplaySection(EngineSection):
 def trace_and_replay(
     compress_db: float | None, study: OpenedStudy, materials: Mapping[str, Material]
 ) -> Replay | ReplayCarriers:
-    """The replay of a chunk's links on paths traced with the given materials; the function can be sent to a worker."""
+    """The replay of a chunk's links on paths traced with the given materials; picklable, for use on workers."""
     return replay(study, study.trace(materials), compress_db)
 
 

@@ -38,7 +38,7 @@ _CLAIMS: Final = """CREATE TABLE IF NOT EXISTS claims (
     problem TEXT NOT NULL, candidate BLOB NOT NULL, run TEXT NOT NULL, owner TEXT NOT NULL, expires REAL NOT NULL,
     PRIMARY KEY (problem, candidate)) WITHOUT ROWID"""
 EXPIRY: Final = 300.0  # time without a renewal after which a claim ends, as the observer measures it [s]
-SKEW: Final = 86_400.0  # largest difference between the clocks of two machines [s]; older claims end at once
+SKEW: Final = 86_400.0  # largest accepted difference between the clocks of two machines [s]
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
@@ -73,7 +73,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
     A claim is invalid if its process has ended or has not renewed the claim for `EXPIRY`. `expires` and `now` are times
     [s since 1970] on the clocks of the claim's machine and of this machine.
     """
-    # A clock may be wrong by `SKEW`; a claim further away from now is damaged or was left behind.
+    # A clock may be wrong by `SKEW`; a claim with an expiry further from now is damaged or was left behind.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
     try:
@@ -295,7 +295,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
 def insert_problem(
     connection: sqlite3.Connection, problem: str, engine: str, parameters: Sequence[str]
 ) -> None:
-    """Write the parameter names of a problem's candidates, unless the ledger already contains them."""
+    """Write a problem's engine and the names of its parameters, unless the ledger already contains them."""
     connection.execute(
         "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)", (problem, engine, json.dumps(list(parameters)))
     )

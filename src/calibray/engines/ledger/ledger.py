@@ -43,8 +43,8 @@ class Ledger:
         read_only: Whether the file cannot be written.
 
     Raises:
-        InputError: The file cannot be opened, is not a ledger of this version, is a link, has other names, or is
-            damaged.
+        InputError: The file cannot be opened, is damaged, is not a ledger of this version, or is a symbolic or hard
+            link.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -57,7 +57,7 @@ class Ledger:
             database.check_own_file(self.path)
             self._connection = self._connect()
             try:
-                # SQLite opens the file by name, so it may have been replaced meanwhile.
+                # SQLite opens the file by name, so it may have been replaced in the meantime.
                 database.check_own_file(self.path)
                 database.set_up(self._connection, self.path)
                 self._file = _identity(self.path)
@@ -79,7 +79,7 @@ class Ledger:
                     shutil.copyfile(f"{self.path}{ending}", f"{file}{ending}")
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
-        # Without an isolation level, every statement is a transaction and committed when `execute` returns.
+        # Without an isolation level, every statement is a transaction, which is committed when `execute` returns.
         return sqlite3.connect(file, timeout=database.LOCK_WAIT, isolation_level=None)
 
     def _insert_rescued(self) -> None:
@@ -108,7 +108,7 @@ class Ledger:
             self._copy.cleanup()
 
     def describe(self, problem: str, engine: str, parameters: Sequence[str]) -> None:
-        """Write the parameter names of a problem's candidates.
+        """Write a problem's engine and the names of its parameters.
 
         Raises:
             EngineError: The ledger cannot be written.
@@ -117,7 +117,7 @@ class Ledger:
             database.insert_problem(self._connection, problem, engine, parameters)
 
     def changed_program_files(self, problem: str, files: Mapping[str, str]) -> list[str]:
-        """Names of the files of a program that have changed since its stored calls.
+        """Names of a program's files that have changed since its calls were stored.
 
         `files` contains the current files with their digests. If the problem has no stored calls, these digests are
         stored.
@@ -187,7 +187,7 @@ class Ledger:
             database.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: database.LedgerEntry) -> database.LedgerEntry:
-        """Write an entry, unless another run has written one first; return the stored entry.
+        """Write an entry, unless another run has already written one; return the stored entry.
 
         Raises:
             EngineError: The ledger cannot store the entry; `rescue` can write it to a file.
@@ -221,7 +221,7 @@ class Ledger:
         return _describe_rescue(database.write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete the failed calls of one problem or of all problems, so that they are run again; return their number.
+        """Delete the failed calls of one or all problems, so that they are run again; return their number.
 
         Raises:
             InputError: The ledger is read-only.

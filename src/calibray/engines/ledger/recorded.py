@@ -42,8 +42,8 @@ class Recorded:
         program_files: SHA-256 of the files of the engine's program by name, if it has any.
 
     Attributes:
-        hits: Number of candidates so far that required no RT call, because they were in the ledger or repeated in a
-            batch.
+        hits: Number of candidates so far that required no RT call, because they were in the ledger or repeated a
+            candidate of their batch.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Recorded:
                 pause = min(2 * pause, LONGEST_WAIT)
 
     def _warn_of_changed_files(self) -> None:
-        """Before the first answer, warn if the calls in the ledger come from other files of the program."""
+        """Before the first answer, warn if the program's files have changed since the calls in the ledger."""
         files, self._unchecked_files = self._unchecked_files, {}
         if files and (changed := self._ledger.changed_program_files(self._problem, files)):
             _LOG.warning(
@@ -170,7 +170,7 @@ class Recorded:
     def _from_engine(
         self, values: NDArray[np.float64], indices: dict[bytes, list[int]], stop: Event
     ) -> Iterator[Answer]:
-        """Yield the engine's answers to candidates that this run has claimed, given by their indices in the batch."""
+        """Yield the engine's answers to claimed candidates; `indices` contains their positions in the batch."""
         keys = list(indices)
         with self._ledger.working():
             answers = self._engine.answers(values[[indices[candidate][0] for candidate in keys]], stop)

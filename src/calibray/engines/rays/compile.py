@@ -1,4 +1,4 @@
-"""Convert a ray table to a path program and back, with checks and the correction of every path's power.
+"""Convert a ray table to a path program, with checks and a correction for every path, and back.
 
 The correction is the power that the engine states divided by the power of the replay. It accounts for properties that
 only the engine models, such as its antennas. At other constants, the replayed power is multiplied by the correction.
@@ -52,12 +52,13 @@ a few rounding errors of a field in single precision, as in Sionna RT.
 """
 
 HIGH_GAIN_DB: Final = 25.0
-"""Total gain of both antennas above which a warning is issued [dB], such as 18 dBi of a sector antenna plus 7 dBi."""
+"""Total gain of both antennas above which a warning is issued [dB], such as 18 dBi at one end and 7 dBi at the other.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class RaySetting:
-    """Context that is needed to read the paths of a table.
+    """Context for compiling the paths of a table.
 
     Attributes:
         scene: The scene, with the constants that the engine used.
@@ -90,7 +91,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         raise InputError(f"{table.source}: no path has a power above 0; export the rays of at least one link")
     ends, link, chosen = _assign_links(table, setting.links)
     link = np.where(absent, -1, link)
-    # Paths that belong to no link, or have no power, have the number -1; they come first and are left out.
+    # Paths that belong to no link or have no power have the link index -1; they come first and are left out.
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
     _check_repeats(table, link)
@@ -103,7 +104,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     settings = {"rays": table.source, "scene": scene.source, "largest_distance_m": distance}
     paths = replace(paths, settings=settings)
     if scene.local_origin.any():
-        # In double precision, because single precision would round vertices far from the origin.
+        # Vertices far from the origin are kept in double precision, because single precision would round them.
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
         # In a null of the antennas, a path may have no power in replay, and only a rounding error in the engine.

@@ -1,4 +1,4 @@
-"""The rays of one RT call, and an engine that returns rays and stores them."""
+"""The rays of one RT call, and an engine that keeps the rays of its calls."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Export:
 
 @final
 class Exporting:
-    """An engine that returns rays and stores them, so that each candidate requires only one call.
+    """An engine that returns rays, and keeps them so that each candidate requires only one call.
 
     Attributes:
         parameters: The parameters whose values a candidate contains.
@@ -93,7 +93,7 @@ class Exporting:
 
     @property
     def hits(self) -> int:
-        """Number of candidates so far that were answered by the ledger."""
+        """Number of candidates so far whose answers came from the ledger."""
         return self._engine.hits if isinstance(self._engine, Recorded) else 0
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -75,7 +75,8 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     """The rows of a ray table, of a file that contains one, or of the paths of another program.
 
     Raises:
-        InputError: The file or folder is malformed or of an unknown kind, or the power is not a finite number.
+        InputError: The file or folder is malformed or of an unknown kind, or the transmitted power is missing, not a
+            finite number or not applicable.
     """
     if tx_power_dbm is not None and not (isinstance(tx_power_dbm, Real) and np.isfinite(tx_power_dbm)):
         raise InputError(f"tx_power_dbm = {tx_power_dbm!r}: must be a finite number, in dBm")
@@ -121,8 +122,8 @@ def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
     """Read the paths of one transmitter from a text file `*.paths.*.p2m` of Remcom Wireless InSite.
 
     Lines that begin with # are comments. The first line contains the number of receivers. Each receiver has a line with
-    its number and its number of paths and, if there are any paths, a line of totals. Each path has a line of nine
-    numbers (number, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]),
+    its index and its number of paths, followed by a line of totals if there are any paths. Each path has a line of nine
+    numbers (index, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]),
     or of eight numbers without the phase. A line such as Tx-R-D-Rx and a line for each point follow.
 
     Raises:
@@ -186,7 +187,7 @@ def _insite_numbers(file: Path, line: tuple[int, str], *counts: int) -> list[flo
 
 AODT_FILES: Final = ("raypaths.parquet", "cirs.parquet")
 AODT_UNIT: Final = 0.01
-"""Unit of lengths [m]."""
+"""Unit of lengths in an export [m]."""
 
 AODT_PAIR: Final = ["ru_id", "ue_id"]
 AODT_ELEMENT: Final = "ru_ant_el"
@@ -199,8 +200,8 @@ AODT_TYPES: Final = {
 def read_aodt(folder: Path) -> SourceTable:
     """Read the first time step with paths from an export folder of NVIDIA's Aerial Omniverse Digital Twin.
 
-    The folder contains two tables, which both state the time, the radio unit and the user equipment. `raypaths` has a
-    row for each path, with its points in units of the scene (centimetres) and its types of interactions. `cirs` has a
+    The folder contains two tables, both of which state the time, the radio unit and the user equipment. `raypaths` has
+    a row for each path, with its points in units of the scene (centimetres) and its types of interactions. `cirs` has a
     row for each pair of antenna elements, with lists of complex gains and delays [s] in the order of the paths.
 
     Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
@@ -216,7 +217,7 @@ def read_aodt(folder: Path) -> SourceTable:
         table.frame["time_idx"].to_numpy() if "time_idx" in table.frame else np.zeros(len(table))
         for table in (rays, gains)
     ]
-    # A first step without paths may have rows in only one of the tables.
+    # If the first step has no paths, only one of the tables may have rows for it.
     frames = [table.frame[time == times[0].min()] for table, time in zip((rays, gains), times, strict=True)]
     responses = {key: rows for key, rows in frames[1].groupby(AODT_PAIR, sort=False)}
     paths = []
@@ -305,11 +306,11 @@ def _aodt_types(table: SourceTable, types: Any) -> list[str]:
 
 DEEPMIMO_TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", "4": "transmission"}
 DEEPMIMO_OLD_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
-"""Matrices and their names in earlier versions."""
+"""Names of matrices in earlier versions, by their present names."""
 
 
 def is_deepmimo(folder: Path) -> bool:
-    """Whether a folder contains matrices of a scenario."""
+    """Whether a folder contains the power matrices of a scenario."""
     return any(_deepmimo_files(folder))
 
 
@@ -321,7 +322,7 @@ def read_deepmimo(folder: Path) -> SourceTable:
     [m]. Missing paths are NaN in all matrices.
 
     Raises:
-        InputError: A matrix is missing, malformed or too large, or its shape does not match the others.
+        InputError: A matrix is missing, malformed or too large, or the shapes of the matrices do not match.
     """
     paths = [path for file in _deepmimo_files(folder) for path in _deepmimo_paths(file)]
     return rows_of(paths, str(folder))
@@ -420,8 +421,8 @@ def check_carrier(rays: Any, frequency: float) -> None:
 def read_sionna_paths(paths: Any) -> SourceTable:
     """Read paths of Sionna RT in memory, as returned by its `PathSolver`, for arrays with a single antenna position.
 
-    Vertices and interactions have the shape [D, R, T, P] with synthetic arrays; otherwise, their shape is [D, R, Ra, T,
-    Ta, P] for the antennas of the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
+    The shape of vertices and interactions is [D, R, T, P] with synthetic arrays, and otherwise [D, R, Ra, T, Ta, P],
+    where Ra and Ta count the antennas of the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
 
     Powers are summed over the ports of a receiver and averaged over those of a transmitter.
 

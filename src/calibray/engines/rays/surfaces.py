@@ -28,7 +28,7 @@ class Surfaces:
     Attributes:
         corners: Corners of every triangle [F, 3, 3], [m].
         normal: Unit normals, pointing to either side [F, 3].
-        material: Index in `Scene.materials` [F].
+        material: Index of the material in `Scene.materials` [F].
     """
 
     corners: NDArray[np.float64]
@@ -57,7 +57,7 @@ class Surfaces:
     def near(
         self, point: NDArray[np.float64], within: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Pairs of points [n, 3] and faces within a distance [m]: indices of point and face, and distance, each [k]."""
+        """Find faces within a distance [m] of points [n, 3]; return indices of points and faces, and distances [k]."""
         pairs = list(self._box_pairs(point, within))
         index, face = (
             (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else np.zeros((2, 0), int)
@@ -112,7 +112,7 @@ class Hits:
     label: NDArray[np.str_]
 
     def mirror_error(self, index: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance between the end of the reflected ray and the path, for hits with normals [k, 3], [m]."""
+        """Distance of the path from the ray reflected at normals [k, 3], at the end of the shorter segment [k], [m]."""
         incident = self.incident[index]
         mirrored = incident - 2 * np.sum(incident * normal, axis=1)[:, None] * normal
         return np.linalg.norm(mirrored - self.leaving[index], axis=1) * self.length[index]
@@ -218,7 +218,7 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
             f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path there; "
             "check the vertex, or remove the path"
         )
-    # Of pairs with the same error, the one whose 0-face the wave meets most directly is used.
+    # Among pairs with equal errors, the pair whose 0-face the wave meets most nearly head-on is used.
     return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(hits.incident[number], edge.normal_0)))
 
 
@@ -235,7 +235,7 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
     normal_0 = -normal_0 * np.sign(np.dot(into_n, normal_0))
     normal_n = -normal_n * np.sign(np.dot(into_0, normal_n))
     direction /= np.linalg.norm(direction)
-    # The tangent n_0 x e of Sionna RT's azimuths points into the 0-face.
+    # Sionna RT measures azimuths from the tangent n_0 x e, which points into the 0-face.
     direction *= np.sign(np.dot(np.cross(normal_0, direction), into_0))
     # A ray behind both faces runs within the wedge; the wave must meet the 0-face from outside.
     inside = [np.dot(end, normal_0) < 0 and np.dot(end, normal_n) < 0 for end in (-incident, leaving)]

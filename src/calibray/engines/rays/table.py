@@ -68,7 +68,7 @@ class RayTable:
     Attributes:
         source: Name of the table, for messages.
         path: Number or label of every path [P].
-        link: Number or label of every path's link [P]; None if links are distinguished by the ends of their paths.
+        link: Number or label of every path's link [P]; None if the ends of a path determine its link.
         tx: Transmitter position of every path [P, 3], [m].
         rx: Receiver position of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
@@ -93,7 +93,7 @@ class RayTable:
 
     @classmethod
     def of(cls, table: SourceTable, axes: str = "x y z") -> RayTable:
-        """Read paths from rows; `axes` lists the table's axes for the scene's x, y and z, such as "x -z y".
+        """Read paths from rows; `axes` lists the table axes that become the scene's x, y and z, such as "x -z y".
 
         Raises:
             InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
@@ -368,7 +368,7 @@ def read_ray_file(file: str | Path) -> SourceTable:
 
 
 def parse_rays(content: bytes, source: str) -> SourceTable:
-    """Read the rows of a table in memory, in JSON or HDF5.
+    """Read the rows of a table from JSON or HDF5 in memory.
 
     Raises:
         InputError: The content is malformed.
@@ -399,7 +399,7 @@ def _parsed(content: Path | BytesIO | str | Mapping[Any, Any], source: str) -> S
             frame = pd.DataFrame(json.loads(content) if isinstance(content, str) else content)
     except InputError:
         raise
-    # Text nested too deeply raises a RuntimeError.
+    # JSON nested too deeply raises a RecursionError, which is a RuntimeError.
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         fault = shortened(str(error))
         raise InputError(f"{source}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
