@@ -122,7 +122,7 @@ def test_the_first_failed_call_is_reported_with_its_reason_and_where_to_list_the
         engine.path_loss(CANDIDATES)
     (message,) = [record.getMessage() for record in caplog.records]
     assert message.startswith(
-        "an RT call failed, so all its links are treated as links without a path; list failed "
+        "an RT call failed, so all links count as links without a path for its candidate; list failed "
     )
     assert f"calibray ledger {ledger.path.parent}, or add --forget-failed" in message
     assert message.endswith("The failed call: it failed")

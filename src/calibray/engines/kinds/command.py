@@ -139,7 +139,8 @@ class Command:
         values = check_candidates(candidates, len(self.parameters))
         if derivatives or wanted != tuple(each.statistic for each in self._study.radio.observables):
             raise InputError(
-                f"{self._source}: the program returns only the study's [observables], and no derivatives"
+                f"{self._source}: the program returns only the observables that the study lists, and no "
+                "derivatives"
             )
         return gather_responses(self.answers(values), (len(values), self.num_links), len(wanted), first)
 

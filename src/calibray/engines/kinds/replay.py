@@ -81,8 +81,8 @@ class ReplaySection(EngineSection):
         displaced = [item.name for item in study.parameters if item.is_effect and item.field in DISPLACED]
         if displaced:
             raise InputError(
-                f"{study.source}: parameters: {displaced[0]!r}: path loss between traced positions can be checked only "
-                "for all links together; calibrate without workers (--workers, --scheduler) and without "
+                f"{study.source}: parameters: {displaced[0]!r}: this parameter displaces antennas, so all links "
+                "must be traced together; calibrate without workers (--workers, --scheduler) and without "
                 "engine.chunk_links"
             )
         chunks = cut(study.links, chunk_size(self.chunk_links, len(study.links)))
@@ -100,7 +100,7 @@ class ReplaySection(EngineSection):
         ):
             raise InputError(
                 f"{study.source}: engine.compress_db = {self.compress_db:g} requires objective.combining = 'power' "
-                "and a single carrier, without coefficients of laws as parameters; remove engine.compress_db"
+                "and a single carrier, and no coefficient of a frequency law as a parameter; remove engine.compress_db"
             )
 
 

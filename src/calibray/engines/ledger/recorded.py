@@ -110,8 +110,8 @@ class Recorded:
         elif failures and not self._warned:
             self._warned = True
             _LOG.warning(
-                "an RT call failed, so all its links are treated as links without a path; list failed calls with %s, "
-                "or add --forget-failed to delete them, so that the next run repeats them. The failed call: %s",
+                "an RT call failed, so all links count as links without a path for its candidate; list failed calls "
+                "with %s, or add --forget-failed to delete them and run them again. The failed call: %s",
                 command("ledger", self._ledger.path.parent), printable(failures[0], keep="\n\t"),
             )  # fmt: skip
         return answers, first
@@ -154,8 +154,9 @@ class Recorded:
         files, self._unchecked_files = self._unchecked_files, {}
         if files and (changed := self._ledger.changed_program_files(self._problem, files)):
             _LOG.warning(
-                "%s: %s changed since the stored RT calls of this study, which are used again; if the change affects "
-                "the answers, use another folder, or delete the ledger", self._ledger.path, ", ".join(changed),
+                "%s: %s changed since the stored RT calls of this study; these calls are used again. If the "
+                "change affects their answers, use another folder, or delete the ledger",
+                self._ledger.path, ", ".join(changed),
             )  # fmt: skip
 
     def _from_ledger(self, missing: dict[bytes, list[int]]) -> Iterator[Answer]:

@@ -380,7 +380,8 @@ def _matrix(file: Path) -> NDArray[np.float64]:
             size = 8 * sum(int(np.prod(shape)) for _, shape, _ in whosmat(file))
         if size > LARGEST_ARRAYS:
             raise InputError(
-                f"{file}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20}; export fewer receivers"
+                f"{file}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20} MiB; export fewer "
+                "receivers"
             )
         if file.suffix == ".npz":
             with np.load(file, allow_pickle=False) as packed:

@@ -362,7 +362,8 @@ def read_ray_file(file: str | Path) -> SourceTable:
         return _parsed(path, str(path))
     if (size := path.stat().st_size) > LARGEST_JSON:
         raise InputError(
-            f"{path}: {size / 2**20:,.0f} MiB of JSON, must be at most {LARGEST_JSON // 2**20}; write .parquet or .h5"
+            f"{path}: {size / 2**20:,.0f} MiB of JSON, must be at most {LARGEST_JSON // 2**20} MiB; write "
+            ".parquet or .h5"
         )
     return parse_rays(path.read_bytes(), str(path))
 
@@ -463,7 +464,8 @@ def _read_hdf5(content: Path | BytesIO, source: str) -> pd.DataFrame:
                 )
         if (size := sum(item.nbytes for item in columns.values())) > LARGEST_ARRAYS:
             raise InputError(
-                f"{source}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20}; export fewer links"
+                f"{source}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20} MiB; export fewer "
+                "links"
             )
         # MATLAB writes a vector as a matrix with one row or column.
         return pd.DataFrame(
