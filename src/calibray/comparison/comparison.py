@@ -1,8 +1,8 @@
 """Comparison of methods at equal budgets: every method runs with many seeds on one problem.
 
-The result is the excess of every method as a function of the number of RT calls, in the form of arrays, tables, files
-and a figure. The excess is the best objective so far minus the global optimum on the same data. The optimum comes from
-least squares with many starts, or from another search that reached a lower value.
+The result is the excess of every method as a function of the number of RT calls, as arrays, tables, files and a figure.
+The excess is the best objective so far minus the global optimum on the same data. The optimum comes from least squares
+with many starts, or from another search that reached a lower value.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Comparison:
         return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
 
     def quartiles(self, name: str, calls: int) -> tuple[float, float, float]:
-        """Lower quartile, median and upper quartile of `excess`, [dB]."""
+        """Lower quartile, median and upper quartile of `excess` [dB]."""
         excess = self.excess(name, calls)
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
@@ -252,7 +252,7 @@ ROUNDING_DB: Final = 1e-7
 """Difference below which two objectives are considered equal [dB]."""
 
 OPTIMUM: Final[RunKey] = ("optimum", 0, 0)
-"""Key under which the reference search is stored among the runs."""
+"""Key of the reference search among the stored runs."""
 
 REFERENCE: Final = "least-squares"
 """Method of the reference search."""

@@ -1,7 +1,7 @@
 """The paper's experiment: the demo district is calibrated with GWO, SGWO-IM, space mapping and `auto`.
 
-Space mapping runs with the engine "retrace", which traces again for every candidate. "retrace" represents engines
-without stored paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
+Space mapping runs with the engine "retrace", which traces again for every candidate. The engine "retrace" stands for
+engines without stored paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MAPPING_CALLS: Final = 8
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment, with the paper's methods on the engine "replay" (one trace) or "retrace" (one per RT call).
+    """Run the experiment, with the paper's methods on "replay" (one trace) or "retrace" (one trace per RT call).
 
     `progress` is called for every stage, with the method's label in front of the name of the stage.
 

@@ -11,7 +11,7 @@ in a box-shaped trust region. Points that span all directions within the region 
 models fully linear. If a direction is missing and the step failed, a point along this direction is evaluated before the
 region shrinks.
 
-Gauss-Newton is the usual method of users with a least-squares solver but without derivatives. Every accepted point
+Gauss-Newton is the usual choice of users who have a least-squares solver but no derivatives. Every accepted point
 requires one further evaluation per parameter, all in one batch. `descent.py` computes the steps.
 """
 
@@ -108,7 +108,7 @@ class _Points(NamedTuple):
 
 
 def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: float) -> Search:
-    """One local search with trust-region radii from `radius` down to `last`; yields candidates [n, d] in the box."""
+    """Run one local search with trust-region radii from `radius` down to `last`; yields candidates [n, d]."""
     box, d = archive.box, len(start)
 
     def evaluated(
@@ -126,14 +126,14 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         best = int(np.argmin(points.value))
         centre = points.unit[best]
         chosen, missing = _spanning(points, best, radius)
-        # A model needs d points in addition to the best one; distant ones are used if near ones are missing.
+        # A model needs d points in addition to the best one; distant points are used if there are too few near ones.
         if missing is None or len(chosen) == d:
             step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
             if predicted > 0 and np.abs(step).max() > 1e-3 * last:
                 before = points.value[best]
                 points = yield from evaluated(points, np.clip(centre + step, 0.0, 1.0)[None])
                 ratio = (before - points.value[-1]) / predicted
-                # A successful step that ends near the edge of the trust region suggests a larger one.
+                # A successful step that ends near the edge of the trust region suggests a larger region.
                 if ratio >= ACCEPTED:
                     radius = min(2 * radius, LARGEST) if np.abs(step).max() > 0.75 * radius else radius
                     continue
@@ -285,7 +285,7 @@ class GaussNewton(Optimizer):
 
 
 def _newton(archive: Archive, start: NDArray[np.float64], step: float, tolerance: float) -> Search:
-    """One local search; yields candidates [n, d] in the box."""
+    """Run one local search; yields candidates [n, d] in the box."""
     box, lowest = archive.box, np.inf
     descent = descend(start[None], 10**6, tolerance)
     unit = next(descent)

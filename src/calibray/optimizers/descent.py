@@ -80,7 +80,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
 def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Steps [s, d] that stay inside the unit cube, and the decreases in cost that the models predict [s]."""
     count, dimension = starts.unit.shape
-    # The floor keeps the matrix regular if two parameters have the same effect and the damping is negligible.
+    # The floor keeps the matrix non-singular if two parameters have the same effect and the damping is negligible.
     floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
     damping = np.maximum(starts.damping, floor)
     damped = starts.curvature + damping[:, None, None] * np.eye(dimension)
@@ -114,7 +114,7 @@ def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
     """Accept or reject trial points by comparing actual and predicted decreases in cost [s]; update the damping."""
-    # A failed trial has an infinite cost, hence a ratio of minus infinity.
+    # A failed trial has an infinite cost, so its ratio is minus infinity.
     ratio = (starts.cost - trial.cost) / predicted
     better = ratio > 1e-4
     gain = np.where(better, ratio, 0.0)

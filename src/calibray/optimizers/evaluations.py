@@ -12,7 +12,7 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Function that maps residuals [n, m] to values [n], which must increase with the mean square of the residuals."""
+"""Function that maps residuals [n, m] to values [n]; a value must increase with the mean square of its residuals."""
 
 OBJECTIVE_TOLERANCE = 1e-4
 """Largest accepted relative difference between a value and its computation from the residuals; allows for float32."""
@@ -156,7 +156,7 @@ class Archive:
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
     def imputed(self, evaluations: Evaluations) -> Evaluations:
-        """Assign the value and residuals of the worst success to failed evaluations, so that models avoid them.
+        """Give failed evaluations the value and residuals of the worst successful one, so that models avoid them.
 
         Both are zero if every evaluation so far has failed.
         """
@@ -226,7 +226,7 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that a lower value means a lower mean square for the new evaluations and the best one so far.
+    """Check that values rise with the mean square of the residuals, for the new evaluations and the best one so far.
 
     Raises:
         InputError: An evaluation has a lower value than another one, but a higher mean square.

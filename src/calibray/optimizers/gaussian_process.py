@@ -68,7 +68,7 @@ class GaussianProcess(Optimizer):
                 x = self._rng.random(d)
             else:
                 kernel = None if model is None else model.process.kernel
-                # The kernel is fitted again at every step up to 40 points, and at every tenth step after that.
+                # The kernel is fitted at every step up to 40 points, and at every tenth step after that.
                 if kernel is None or len(points) <= 40 or turn % 10 == 0:
                     model = fit(points, values, guess=kernel)
                 else:

@@ -53,7 +53,7 @@ PARENTS = 12
 """Number of lowest minima that are combined."""
 
 SPACE = 0.05
-"""Smallest distance in the unit cube from a combination to the known minima and to the other combinations."""
+"""Smallest distance in the unit cube between a combination and a known minimum or another combination."""
 
 ROUND = 64
 """Number of starting points per round."""
@@ -73,7 +73,7 @@ LEVEL = 1e-4
 """Relative difference in mean square below which two minima are considered to fit equally well, as along a valley."""
 
 NOISELESS = 1e-9
-"""Share of the largest mean square added to this difference; without noise, low mean squares are rounding errors."""
+"""Share of the largest mean square added to this difference; without noise, the lowest ones are rounding errors."""
 
 APART = 0.01
 """Distance in the unit cube below which two searches are considered to have ended in the same minimum."""

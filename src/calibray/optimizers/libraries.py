@@ -182,7 +182,7 @@ def _minimise_residuals(
     rng: np.random.Generator,
     evaluate: Evaluate,
 ) -> None:
-    """Minimise from successive starting points indefinitely."""
+    """Minimise from one starting point after another; the caller ends the loop."""
     box = archive.box
     d = box.dimension
 
@@ -200,7 +200,7 @@ def _minimise_residuals(
             rhoend=radii[1],
             maxfun=budget + d + 2,  # `limited` enforces the budget, and DFO-LS warns if it is small
             do_logging=False,
-            # Coordinate directions are used, because random ones are drawn from NumPy's global generator.
+            # Coordinate directions are used, because random ones would be drawn from NumPy's global generator.
             user_params={"init.random_initial_directions": False},
         )
         if len(archive) == before:
@@ -236,7 +236,7 @@ class DifferentialEvolution(Optimizer):
 
 
 def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
-    """Minimise with successive populations indefinitely."""
+    """Minimise with one population after another; the caller ends the loop."""
     box = archive.box
 
     def objective(unit: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form

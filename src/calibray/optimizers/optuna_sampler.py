@@ -5,9 +5,9 @@ repeats the same candidates, uses their stored answers, and continues where the 
 did not propose (enqueued, or from another sampler) are added to the archive and can become leaders of the pack. A
 failed trial is treated as a failed evaluation.
 
-The pack cannot move before the iteration is complete. If workers are evaluating every open candidate, a candidate of
-another process is returned again, because that process might have ended. If there is no such candidate, the trial is a
-random point.
+The pack cannot move before the iteration is complete. If every open candidate is being evaluated, one that another
+process is evaluating is returned again, because that process might have ended. If there is no such candidate, the trial
+is a random point.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class SGWOIMSampler(BaseSampler):
             return
         sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
         answer = sign * values[0] if state == TrialState.COMPLETE and values else np.inf
-        # Optuna accepts infinite values; an infinitely good one is no value that a search can improve on.
+        # Optuna accepts infinite values, but no search can improve on an infinitely good one; it counts as failed.
         optimizer.tell([x], [answer if np.isfinite(answer) else np.inf])
 
     def _foreign(self, trial: FrozenTrial) -> list[float]:

@@ -42,7 +42,7 @@ class Session:
         objective: Function that converts residuals to the value, if residuals are used.
 
     Attributes:
-        minima: Distinct minima that the algorithm keeps, the lowest first [k, d]; empty until the algorithm sets them.
+        minima: Distinct minima that the algorithm keeps, lowest first [k, d]; empty until the algorithm sets them.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Session:
             self._answers, self._open = {0: evaluations}, self._open[:0]
             return
         for row, point in enumerate(evaluations.x):
-            # Of equal candidates in a batch, the answer belongs to the first that is still open.
+            # If candidates of a batch are equal, the answer belongs to the first one without an answer.
             same = np.flatnonzero((self._asked[self._open] == point).all(axis=1))
             if same.size:
                 self._answers[int(self._open[same[0]])] = evaluations.rows(np.array([row]))
@@ -123,7 +123,7 @@ class Session:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """Shorten a search's last batch to the budget and then end the search; the search must not end earlier."""
+    """End a search at the budget, shortening its last batch; the search itself must not end earlier."""
     with closing(search):
         x = next(search)
         while True:

@@ -344,7 +344,7 @@ def _precision(free: int, square: NDArray[np.float64], freedom: float) -> NDArra
 
 
 NUGGET = 1e-8
-"""Nugget that keeps the matrix regular, as a share of the prior variance; negligible for any engine."""
+"""Nugget that keeps the matrix non-singular, as a share of the prior variance; negligible for any engine."""
 
 LENGTH = 0.3
 """Prior median of a length scale, as a share of the cube's edge; its logarithm has a standard deviation of 1."""
@@ -356,8 +356,7 @@ NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""A residual does not affect the scales if its standard deviation is below this share of the largest of all residuals.
-"""
+"""A residual does not affect the scales if its standard deviation is below this share of the largest one."""
 
 
 @dataclass(frozen=True, eq=False)

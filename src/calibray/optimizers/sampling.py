@@ -62,7 +62,7 @@ SEPARATION: Final = 1e-4
 
 
 def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance [k] from each point of x [k, d] to the nearest of at least one given point [n, d]."""
+    """Distance [k] from each point of x [k, d] to the nearest of `points` [n, d], n >= 1."""
     return cdist(x, points).min(axis=1)
 
 

@@ -20,7 +20,7 @@ that is updated after every batch:
 Input scales are estimated at every step up to `OFTEN` points, and then whenever the number of points has grown by a
 tenth. In between, points are only added to the model, which saves most of the computing time.
 
-In a batch, every further candidate is chosen as if the answers to the earlier candidates had equalled their
+In a batch, each candidate after the first is chosen as if the answers to the previous ones had equalled their
 predictions. A failed evaluation enters the model with the residuals of the worst successful one.
 """
 
@@ -141,11 +141,11 @@ class VectorSurrogate(Optimizer):
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The initial design [k, d], without the points that are replaced by earlier evaluated points [n, d]."""
+        """The initial design [k, d] without the points that previous evaluations [n, d] replace."""
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
-            # Every earlier point that is not close to another one replaces the nearest point of the design.
+            # Every evaluated point that is not close to one already counted replaces the nearest point of the design.
             clumped = len(counted) and distance_to_nearest(point[None], counted)[0] < spacing
             if len(points) and not clumped:
                 counted = np.vstack([counted, point])
@@ -193,7 +193,7 @@ class VectorSurrogate(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = not_evaluated(candidates, taken, SEPARATION)
-        # Multiplied by the root, these are draws with the covariance of the residuals.
+        # Multiplied by the root, these draws have the covariance of the residuals.
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
         mean, share = model.predict(candidates)
         gain = improvement(mean, share, normal @ model.root, best)

@@ -19,7 +19,7 @@ class SionnaFactory:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Installed versions by package."""
+        """Installed versions, by package."""
         return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
 
     def __call__(

@@ -5,8 +5,7 @@ slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4
 the gain.
 
 The geometry of paths does not depend on the antennas. Paths traced with isotropic vertical antennas store the frames of
-their first and last interactions. Therefore, the fields of these paths with any pattern and orientation need no new
-trace.
+their first and last interactions, so the fields for any pattern and orientation follow without another trace.
 """
 
 from __future__ import annotations
@@ -200,7 +199,7 @@ NEW: Final = "new transmitters"
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Mask of the transmitters affected by a parameter of transmitter `label`; those in `own` have their own."""
+    """Mask of the transmitters that a parameter of `label` affects; those in `own` have parameters of their own."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label

@@ -83,7 +83,7 @@ def load_trace(digest: str) -> Paths | None:
         return None
     try:
         stream = os.fdopen(os.open(path, os.O_RDONLY | NO_LINK), "rb")
-    except OSError:  # there is none, or a link
+    except OSError:  # the file does not exist or is a link
         return None
     with stream:
         if not _is_trusted(os.fstat(stream.fileno())):
@@ -113,7 +113,7 @@ def _is_trusted(status: os.stat_result) -> bool:
 
 
 def store_trace(digest: str, paths: Paths) -> None:
-    """Store a trace under its fingerprint; nothing happens if the cache folder cannot be written to."""
+    """Store a trace under its fingerprint; nothing is stored if the cache folder cannot be written to."""
     path = _path(digest)
     if path is not None:
         with suppress(OSError, InputError):

@@ -1,7 +1,7 @@
 """Checks whether a trace launched enough rays, by tracing again with twice as many rays and a different seed.
 
 Rays find paths by chance. With more rays, fewer paths are missed, and diffuse reflection, an average over rays, has
-less sampling noise. The change from a trace to a trace with more rays is an estimate of the error of the first trace.
+less sampling noise. The change in path loss between the two traces is an estimate of the error of the first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PathLoss = Callable[[Paths], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Convergence:
-    """The changes from a trace to a trace with more rays.
+    """The changes between a trace and one with more rays.
 
     Attributes:
         samples: Number of rays per transmitter in the trace that was checked.

@@ -75,7 +75,8 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
     accepted. GAIN is in dBd unless its line contains dBi, as the format defines.
 
     Raises:
-        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line, which the message states.
+        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line, whose number is in the
+            message.
     """
     try:
         lines = Path(path).read_text(encoding="latin-1").splitlines()
@@ -177,7 +178,7 @@ LARGEST_EFFICIENCY: Final = 1.5
 SEAM_TOLERANCE_DB: Final = 0.1
 """Largest difference between the gain at the first azimuth and that of the same direction a full turn later [dB]."""
 _STEP_TOLERANCE: Final = 0.01
-"""Largest relative difference between a step and the other steps."""
+"""Largest relative difference between a step and the median step."""
 
 
 @dataclass(frozen=True, eq=False)

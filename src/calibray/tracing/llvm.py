@@ -1,4 +1,4 @@
-"""Chooses the libLLVM or the GPU that Dr.Jit uses to compile the ray tracer.
+"""Chooses whether the ray tracer runs on a GPU, and otherwise the libLLVM with which Dr.Jit compiles it.
 
 Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and an incompatible version aborts the
 whole process. The choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate
@@ -126,12 +126,12 @@ def judge(path: str, reported: tuple[int, ...]) -> Llvm:
     if not reported and (not version or version[0] >= 16):
         return Llvm(path, (), "it reports no LLVM version, unlike every libLLVM since version 16")
     if version[0] < OLDEST_MAJOR:
-        return Llvm(path, version, f"LLVM {version[0]} is too old, Dr.Jit needs {OLDEST_MAJOR} or newer")
+        return Llvm(path, version, f"LLVM {version[0]} is too old; Dr.Jit needs {OLDEST_MAJOR} or newer")
     return Llvm(path, version, None)
 
 
 def inspect(path: str) -> Llvm:
-    """Open a library, given by path or bare name, in a separate process, which a broken library can abort."""
+    """Open a library, given by path or bare name, in a separate process, because a broken library can abort it."""
     output, problem = _probe(_VERSION_PROBE, path)
     if problem is not None:
         return Llvm(path, version_in_name(path), f"it cannot be opened ({problem})")

@@ -38,14 +38,14 @@ class TraceSettings:
         refraction: Follow transmission through surfaces.
         diffraction: Follow first-order diffraction at wedges.
         edge_diffraction: Also follow diffraction at free edges.
-        diffraction_lit_region: Keep diffraction at targets in the lit region, not only at those in the shadow.
+        diffraction_lit_region: Keep diffracted paths to receivers in the lit region as well as in the shadow.
         diffuse_reflection: Follow diffuse reflections.
         samples: Rays per transmitter, 1 to 10^12; with "auto", rays are added in rounds until path loss converges,
             which is not possible with diffuse reflection.
         seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
-        InputError: A number is out of range, or a switch is neither true nor false.
+        InputError: A number is out of range, a switch is not true or false, or "auto" is used with diffuse reflection.
     """
 
     max_depth: int = 3
@@ -76,8 +76,8 @@ class TraceSettings:
 
         if self.diffuse_reflection and self.adaptive:
             raise InputError(
-                "trace.samples = 'auto' adds rays until no new path is found, but diffuse reflection is an average "
-                "over rays; give a number, or diffuse_reflection = false"
+                "trace.samples = 'auto' adds rays until path loss converges, which is not possible with diffuse "
+                "reflection, an average over rays; give a number, or diffuse_reflection = false"
             )
 
     @property
@@ -190,7 +190,7 @@ def as_antenna(value: Antenna | Mapping[str, object] | None, name: str = "antenn
     Error messages call it `name`.
 
     Raises:
-        InputError: The value is neither, or a key or value is unknown.
+        InputError: The value is none of these, or an attribute is unknown or invalid.
     """
     if value is None:
         return Antenna()

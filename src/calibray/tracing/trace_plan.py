@@ -37,7 +37,7 @@ ADAPTIVE_SECONDS: Final = 3.0
 SMALL_LAUNCH: Final = 5_000_000
 """Largest number of lanes of a small launch, which finds at most a few thousand candidates and takes at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
-"""Side of the grid cells that compare interaction points [m]; points of different paths are seldom so close."""
+"""Side of the grid cells for comparing interaction points [m]; points of different paths are seldom so close."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
 
 
 def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
-    """Repeat the last receiver [n, 3], so that few different numbers of receivers occur in launches.
+    """Repeat the last receiver [n, 3], so that launches have only a few different numbers of receivers.
 
     The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is increased to a power
     of two, or to a multiple of the largest power of two for which a launch is small.

@@ -50,7 +50,7 @@ COMPARED: Final = 3000
 """Largest product of the number of sets tried in a round and the number of answers."""
 
 FOLLOWED: Final = 4
-"""Number of sets from which a round descends, in addition to the present set; these explain the answers best."""
+"""Number of best-fitting sets from which a round descends, in addition to the present set."""
 
 REFITTED: Final = 2
 """Number of results of a round for which the kernel is fitted again."""
@@ -141,7 +141,7 @@ class Corrected:
 
     @property
     def root(self) -> NDArray[np.float64]:
-        """Factor of the covariance of the residuals, as in `Process.root`."""
+        """Factor B of the covariance B^T B of the residuals, as in `Process.root`."""
         return self.discrepancy.root
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -179,7 +179,7 @@ class Corrected:
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """The model with other constants [q] and a discrepancy through the same answers; None keeps the kernel."""
+        """The model with other constants [q] and a discrepancy through the same answers; the kernel is kept if None."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -229,7 +229,7 @@ def with_discrepancy(
     noisy: bool = False,
     guess: Corrected | None = None,
 ) -> Corrected:
-    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides a further initial kernel."""
+    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides another initial kernel."""
     unit, residuals = answers
     response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
     base = cheap.residuals(unit, constants)

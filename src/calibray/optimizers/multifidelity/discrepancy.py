@@ -2,10 +2,10 @@
 
 The discrepancy consists of an offset, a change in response and a remainder: v_0, v_1 and v_2 of `regression.py`. h(x)
 is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the
-parameters, so paths that the cheap model lacks respond like those of other links. The v_1 term is therefore the slope
-of a link's output mapping, and also helps with links that the cheap model does not predict. Each residual has its own
-variance, which is integrated out with an inverse gamma prior. Links that the cheap model predicts badly therefore do
-not affect the others.
+parameters, so paths that the cheap model lacks respond like those of other links. The v_1 term is the slope of a link's
+output mapping, so it also helps with links that the cheap model does not predict. Each residual has its own variance,
+which is integrated out with an inverse gamma prior. Links that the cheap model predicts badly therefore do not affect
+the others.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
@@ -55,7 +55,7 @@ LENGTH_SPREAD: Final = 0.7
 LOG_RATE_BOUNDS: Final = (-2.0, 4.0)
 
 NUGGET: Final = 1e-6
-"""Smallest nugget, relative to the mean square of the response; it keeps the matrix regular."""
+"""Smallest nugget, relative to the mean square of the response; it keeps the matrix non-singular."""
 
 NOISE: Final = (float(np.log(1e-4)), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
@@ -178,7 +178,7 @@ class SampledFunction:
 
 
 def sample_function(process: Process, random: np.random.Generator, stretch: float = 1.0) -> SampledFunction:
-    """Draw a function; `stretch` multiplies its deviations from the mean, so that 0 gives the mean."""
+    """Draw a function; `stretch` multiplies its deviations from the mean, so 0 gives the mean."""
     inputs, kernel = process.inputs, process.kernel
     (count, d), residuals = inputs.unit.shape, process.values.shape[1]
     size = stretch * np.sqrt(kernel.variances)
@@ -205,6 +205,6 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
 
 
 def standardized_error(process: Process, points: NDArray[np.intp]) -> float:
-    """Root mean square of leave-one-out errors divided by their expected standard deviations; 1 if both agree."""
+    """Root mean square of the leave-one-out errors at `points`, each divided by its expected standard deviation."""
     expected = 1.0 / np.outer(process.inverse_diagonal, process.precision)
     return float(np.sqrt(np.mean((process.left_out_errors() ** 2 / expected)[points])))

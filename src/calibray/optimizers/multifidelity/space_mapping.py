@@ -14,17 +14,17 @@ steps:
   exploitation if there is no new minimum.
 
 Both kinds account for constants that a few answers cannot determine, and for the errors of earlier predictions
-(`correction.py`). Otherwise, steps on synthetic districts jump across half the box to predicted minima that do not
-exist.
+(`correction.py`). On synthetic districts, steps would otherwise jump across half the box to predicted minima that do
+not exist.
 
 The cheap model is used only as long as it helps. Each point is predicted from all other points, once by the corrected
-model and once by the same process without a cheap model; `error_ratio` compares the squared errors of the median link.
-The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later checks fail if it exceeds
-`MISLED`. After two failed checks in a row, the vector surrogate continues with all evaluations so far. It also runs
-from the first call if there is no cheap model. The median link decides, because a few links dominate the sum over all
-links. Of twelve synthetic problems, eight had their own cheap model, and four had random sinusoids instead. After four
-calls, the ratio was at most 0.66 with the right model (in one case, 1.9 after three calls), and at least 1.01 with
-sinusoids.
+model and once by the same process without a cheap model; `error_ratio` is the median over the links of the ratio of the
+two squared errors. The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later checks
+fail if it exceeds `MISLED`. After two failed checks in a row, the vector surrogate continues with all evaluations so
+far. If there is no cheap model, the vector surrogate runs from the first call. The median is used, because a few links
+dominate a sum over all links. Of twelve synthetic problems, eight had their own cheap model, and four had random
+sinusoids instead. After four calls, the ratio was at most 0.66 with the right model (in one case, it was 1.9 after
+three calls), and at least 1.01 with sinusoids.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -86,7 +86,7 @@ MEMBERS: Final = 8
 """Largest number of models with other constants that are averaged with the corrected model in the first steps."""
 
 AVERAGED: Final = 10
-"""Largest number of calls up to which predictions are averaged over these models."""
+"""Number of calls up to which predictions are averaged over these models."""
 
 SEPARATION: Final = 1e-3
 """Distance in the unit cube below which a point is considered already evaluated."""
@@ -107,7 +107,7 @@ MISLED: Final = 2.0
 """Error ratio above which a later check fails; by then, points are so close that any process predicts them well."""
 
 DOUBTS: Final = 2
-"""Number of successive failed checks after which the cheap model is dropped; also the number of first checks."""
+"""Number of successive failed checks after which the cheap model is dropped, and of checks that use `HELPFUL`."""
 
 
 @final
@@ -206,7 +206,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """The next minima [count, d] of the uncorrected cheap model after the first `turn`, and then random points."""
+        """Minima of the uncorrected cheap model after the first `turn`, or else random points [count, d]."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -235,7 +235,7 @@ class SpaceMapping(Optimizer):
                 self._errors.add(mean, variance, residuals[row])
 
     def _choose(self, model: Averaged, archive: Archive, count: int) -> NDArray[np.float64]:
-        """The next batch [count, d]."""
+        """Choose the next batch of points [count, d]."""
         evaluated, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(evaluated.x)[np.argsort(evaluated.y, kind="stable")]
         best = archive.lowest

@@ -52,7 +52,7 @@ _LOG: Final = logging.getLogger(__name__)
 class SequenceCache:
     """Interaction sequences of the most recently traced sources.
 
-    Sequences apply to all receivers, so rays are launched once for all chunks of links that are traced on one worker.
+    Sequences apply to all receivers, so rays are launched only once for all chunks of links that one worker traces.
     """
 
     def __init__(self) -> None:
@@ -208,8 +208,9 @@ class _SourceSearch:
         if quiet < QUIET_ROUNDS and self.change_db > CONVERGED_DB:
             x, y, z = self._launch.source.tolist()
             _LOG.warning(
-                "The last of %s rays from position (%.1f, %.1f, %.1f) m still changed path loss by up to %.2f dB, more "
-                "than the tolerance of %g dB, so paths may be missing; reduce trace.max_depth if such changes matter",
+                "After %s rays from position (%.1f, %.1f, %.1f) m, the last round still changed path loss by up to "
+                "%.2f dB, more than the tolerance of %g dB, so paths may be missing; if this matters, reduce "
+                "trace.max_depth",
                 f"{self.rays:,}", x, y, z, self.change_db, CONVERGED_DB,
             )  # fmt: skip
 
@@ -257,7 +258,7 @@ class _SourceSearch:
         # The first buffer holds the direct paths and is kept even if empty: it defines the ends of the links.
         new = [part for part in parts if len(part.link) or is_first]
         if new and not is_first:
-            # Rounding may split a plane in two, so that a sequence is tried twice.
+            # Rounding may split a plane in two, so the same sequence may be tried twice.
             earlier = self.traced[1:]
             new = drop_repeats([*earlier, *new])[len(earlier) :]
         self.traced += new
@@ -267,7 +268,7 @@ class _SourceSearch:
                 "trace.max_depth, or trace fewer links at once"
             )
         gained = np.zeros(len(self._targets))
-        # `link` numbers all links; powers are stored by the position of the link in this launch.
+        # `link` contains indices among all links; powers are in the order of this launch's links.
         order = np.argsort(self._launch.links)
         for part in new:
             gain = self._solver.compute_fields(part)

@@ -40,7 +40,7 @@ def to_points(position: NDArray[np.float64]) -> mi.Point3f:
 
 def to_numpy(vectors: Any) -> NDArray[np.float64]:
     """Convert points or vectors to double precision [n, 3]."""
-    # Otherwise, one kernel computes and interleaves the values, and is compiled anew for each number of vectors.
+    # Otherwise, one kernel computes and interleaves the values, and is compiled again for each number of vectors.
     dr.eval(vectors)
     return np.stack([np.array(axis, dtype=float) for axis in vectors], axis=-1)
 
@@ -132,7 +132,7 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions.
     Candidates for one direction are therefore also candidates for the other. Candidates are reversed before their
-    geometry is computed, so that paths searched from either end are identical to the last digit. Three properties
+    geometry is computed, so that a path is identical to the last digit, whichever end sent the rays. Three properties
     depend on the direction: the order of the interactions, the two ends, and the faces of an edge, because Sionna's
     0-face is the illuminated face.
     """

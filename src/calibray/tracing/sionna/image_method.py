@@ -1,9 +1,9 @@
 """The method of images for all receivers of one source.
 
-Sionna keeps an interaction sequence (the objects with which a path interacts, in order) only if a receiver is visible
-from the point that a ray hit. Sionna therefore tests every hit of every ray with every receiver. Here, rays are
-launched in a scene in which nothing obstructs a receiver (`Unobstructed`). The sequences therefore depend only on the
-source and apply to all receivers.
+Sionna keeps an interaction sequence (the surfaces and edges with which a path interacts, in order) only if a receiver
+is visible from the point that a ray hit. Sionna therefore tests every hit of every ray against every receiver. Here,
+rays are launched in a scene in which nothing obstructs a receiver (`Unobstructed`). The sequences therefore depend only
+on the source and apply to all receivers.
 
 Unfolding a sequence yields the points at which its paths must aim. By the method of images, a path with reflections is
 a straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the
@@ -288,7 +288,7 @@ def possible_pairs(
         )
         good = (edge_length == 0) | ((along_edge > -MARGIN) & (along_edge < edge_length + MARGIN))
         along_edge = dr.select(edge_length > 0, along_edge, 0)
-        # Going back from the receiver, each plane must be crossed where the scene has a surface.
+        # From the receiver backwards, the line must cross each plane where the scene has a surface.
         for step in reversed(range(depth)):
             at = sequence * depth + step
             kind = dr.gather(mi.UInt, kinds, at)

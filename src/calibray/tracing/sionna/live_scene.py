@@ -131,7 +131,7 @@ def _checked(scene: object) -> Any:
 
 
 def _objects(item: Any) -> Iterator[MeshObject]:
-    """The connected surfaces of an object, whose names differ from those of materials."""
+    """The connected surfaces of an object; their names differ from those of materials."""
     values = mi.traverse(item.mi_mesh)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
     face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)
@@ -152,7 +152,7 @@ def _objects(item: Any) -> Iterator[MeshObject]:
 
 
 def _check_precision(objects: Iterable[MeshObject]) -> None:
-    """Refuse a scene so far from its origin that single precision rounds coordinates noticeably, or log a warning."""
+    """Refuse a scene, or warn, if single precision rounds its coordinates noticeably far from the origin."""
     furthest = max((float(np.abs(item.mesh.vertices).max()) for item in objects), default=0.0)
     step = float(np.spacing(np.float32(furthest)))
     where = f"the scene reaches {furthest:.0f} m from its origin"
@@ -235,8 +235,7 @@ def _vector(value: Any) -> NDArray[np.float64]:
 
 
 LARGEST_DIFFERENCE_DB: Final = 0.01
-"""Largest path loss difference at which two traces of one scene count as equal [dB]; the constants in the file are
-rounded."""
+"""Largest path-loss difference of traces that count as equal [dB]; the constants in the file are rounded."""
 
 SAMPLES: Final = 20_000
 """Number of rays for the comparison; both scenes use the same rays."""

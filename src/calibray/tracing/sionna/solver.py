@@ -221,7 +221,7 @@ class Solver:
         )
         # Evaluated together: otherwise, reading each array would run the whole stage again.
         dr.eval(fields.a, fields.tau)
-        # The field stage may clear the flags of paths; they are restored, so that it can run again.
+        # The field stage may mark paths as invalid; the marks are restored, so that it can run again.
         buffer.valid = valid
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
@@ -255,7 +255,7 @@ class Solver:
                 one_edge = {
                     "edge": to_numpy(wedges.e_hat), "normal_n": to_numpy(wedges.nn), "edge_lengths": lengths
                 }  # fmt: skip
-                # A path of Sionna RT has at most one diffraction, whatever its step.
+                # A path of Sionna RT has at most one diffraction, at any step.
                 wedge_arrays = {
                     name: np.broadcast_to(values[:, None], (count, depth, values.shape[1]))
                     for name, values in one_edge.items()

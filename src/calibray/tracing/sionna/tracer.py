@@ -1,6 +1,6 @@
 """Sionna RT as a `Tracer`: finds the paths of links and compiles them.
 
-All receivers of a source share Sionna's path buffer, the memory of which grows with samples x depth x receivers
+All receivers of a source share Sionna's path buffer, whose memory grows with samples x depth x receivers
 (NVlabs/sionna#1172). Receivers, and rays if needed, are therefore split over launches (`calibray.tracing.trace_plan`).
 A launch that fills its buffer is repeated with a larger buffer.
 """
@@ -218,7 +218,7 @@ class Tracer:
             count=launch.rays,
             seed=launch.seed,
             directions=share,
-            # Only the first of the launches to the same receivers finds the direct paths.
+            # Only the first of the launches to the same receivers searches for direct paths.
             direct=settings.line_of_sight and launch.first == 0,
             buffer_size=BUFFER,
             max_paths=max_paths,
