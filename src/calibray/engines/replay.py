@@ -37,7 +37,7 @@ BATCH: Final = 32
 """Largest number of candidates in one call."""
 
 OBSERVED_SIZE: Final = 64
-"""Largest number of candidates in one call for further observables; the function is compiled for this number."""
+"""Largest number of candidates in one call for other observables; the function is compiled for this number."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Replay:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and further observables of every link; see `Observing.respond`."""
+        """Path loss and other observables of every link; see `Observing.respond`."""
         values, batches = check_candidates(candidates, len(self.parameters)), []
         channel = self._measuring(wanted)
         function = fields.link_responses_and_slopes if derivatives else fields.link_responses
@@ -168,7 +168,7 @@ class Replay:
 
     @cached_property
     def _channel(self) -> fields.Channel:
-        """The paths in the form required to compute further observables."""
+        """The paths in the form required to compute other observables."""
         plan = fields.layout(self.paths)
         return fields.Channel(
             plan.program,
@@ -230,7 +230,8 @@ class Replay:
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             too_coarse = table_error > TABLE_TOLERANCE
             refused = np.flatnonzero(too_coarse.any(axis=(1, 2)))
-            # Candidates before the first refused one are accurate; evaluation continues from it with finer tables.
+            # Candidates before the first refused one are accurate; evaluation resumes at the refused one with finer
+            # tables.
             done = refused[0] if len(refused) else len(batch)
             batches.append([np.asarray(answer[:done], dtype=float) for answer in answers])
             start += done
@@ -265,7 +266,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
-        """Refine the tables in the mask [M, 3] for all further candidates; beyond the finest, stop using tables."""
+        """Refine the tables in the mask [M, 3] from now on; if one would exceed `FINEST`, stop using tables."""
         if self._intervals is not None:
             finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -392,7 +393,7 @@ class ReplayCarriers:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and further observables of every link; see `Observing.respond`."""
+        """Path loss and other observables of every link; see `Observing.respond`."""
         candidates = check_candidates(candidates, len(self.parameters))
         parts = []
         for replay, frequency, _ in self._carriers:

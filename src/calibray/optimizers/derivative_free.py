@@ -47,7 +47,7 @@ LARGEST: Final = 0.5
 
 @final
 class POUNDERS(Optimizer):
-    """Derivative-free least squares with quadratic models. Uses residuals and the whole budget.
+    """Derivative-free least squares with quadratic models. Uses residuals; spends the whole budget.
 
     Args:
         seed: Seed of the random points at which searches restart.
@@ -251,7 +251,7 @@ def improving_point(
 
 @final
 class GaussNewton(Optimizer):
-    """Gauss-Newton least squares with finite differences. Uses residuals and the whole budget.
+    """Gauss-Newton least squares with finite differences. Uses residuals; spends the whole budget.
 
     Args:
         seed: Seed of the random points at which searches restart.

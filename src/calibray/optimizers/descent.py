@@ -137,7 +137,7 @@ def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.b
     counts `searches` include the merged searches.
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
-    # Ties are broken by index, so that exactly one of two close searches is better.
+    # Ties are broken by index, so exactly one of two close searches is better.
     rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
     distance = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
     near = (distance < MERGE_DISTANCE) & (rank[None] < rank[number:, None])

@@ -81,7 +81,7 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. Uses only objective values and the whole budget. Needs `calibray[optimizers]`.
+    """Covariance matrix adaptation. Uses only objective values; spends the whole budget. Needs `calibray[optimizers]`.
 
     Args:
         budget: Number of evaluations.
@@ -133,7 +133,7 @@ class CMAES(Optimizer):
 
 @final
 class DFOLS(Optimizer):
-    """Derivative-free least squares. Uses residuals and the whole budget. Needs `calibray[optimizers]`.
+    """Derivative-free least squares. Uses residuals; spends the whole budget. Needs `calibray[optimizers]`.
 
     Args:
         seed: Seed of the random points at which searches restart.
@@ -210,7 +210,7 @@ def _minimise_residuals(
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. Uses only objective values and the whole budget.
+    """Differential evolution. Uses only objective values; spends the whole budget.
 
     Args:
         budget: Number of evaluations.

@@ -102,7 +102,7 @@ class Sampling(Optimizer):
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. Uses only objective values and the whole budget.
+    """Independent uniform points. Uses only objective values; spends the whole budget.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -114,7 +114,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. Uses only objective values and the whole budget.
+    """One point in each slice of every dimension. Uses only objective values; spends the whole budget.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -126,7 +126,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. Uses only objective values and the whole budget.
+    """A scrambled Sobol sequence. Uses only objective values; spends the whole budget.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

@@ -26,7 +26,7 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 SLANTS: Final = {"V": (0.0,), "H": (np.pi / 2,), "VH": (0.0, np.pi / 2), "cross": (-np.pi / 4, np.pi / 4)}
-"""Slant angles of the ports by polarization [rad]."""
+"""Slant angles of the ports, by polarization [rad]."""
 BEAMWIDTH: Final = np.radians(65)
 """Half-power beamwidth of "tr38901" in both planes [rad] (3GPP TR 38.901, Table 7.3-1)."""
 
@@ -191,11 +191,11 @@ POSE: Final = "tx:"
 """Prefix of the parameter names of transmit antennas."""
 FIELDS: Final = ("azimuth", "downtilt", "gain")
 EVERY: Final = "*"
-"""Name of the transmitter that represents all transmitters."""
+"""Name that represents all transmitters."""
 
 
 NEW: Final = "new transmitters"
-"""Name of the transmitter that represents the transmitters without measured links in a population."""
+"""Name that represents all transmitters of a population that have no measured links."""
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:

@@ -31,7 +31,7 @@ PATH_BYTES: Final = (650, 260)
 BUFFER_BYTES: Final = (50, 30)
 """Memory of a path and of each interaction in the tracer's buffer [bytes]."""
 LANES_PER_SECOND: Final = 3e7
-"""Number of lanes that two processor cores trace per second, to estimate the duration of a trace."""
+"""Number of lanes that two processor cores trace per second, for estimates of the duration of a trace."""
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
 SMALL_LAUNCH: Final = 5_000_000

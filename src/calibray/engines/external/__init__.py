@@ -1,1 +1,1 @@
-"""External programs as engines: the files exchanged with them, and the calls of the programs."""
+"""External programs as engines: the files exchanged with them, and the calls that run them."""

@@ -34,7 +34,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
 """Antenna assumed at an end with an unknown antenna. Its two ports cover every polarization, and the correction
-accounts for its gain.
+accounts for the gain of the real antenna.
 """
 
 FREE_SPACE_DB: Final = 1.0

@@ -241,7 +241,7 @@ def read_aodt(folder: Path) -> SourceTable:
 def _aodt_response(
     source: str, pair: Any, rows: Any, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power and delay of every path between a radio unit and a user equipment."""
+    """Power and delay of every path between one radio unit and one user terminal."""
     lists = [
         [_aodt_numbers(source, name, value) for value in rows[name]]
         for name in ("cir_re", "cir_im", "cir_delay")

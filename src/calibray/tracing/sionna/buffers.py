@@ -90,7 +90,7 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
     """Remove the entries that Sionna RT 2.2 counts but does not fill, which occur with refraction.
 
     An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each
-    empty entry into a further direct path between the two.
+    empty entry into another direct path between the two.
     """
     if not buffer.buffer_size:
         return buffer

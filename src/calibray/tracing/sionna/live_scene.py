@@ -281,7 +281,7 @@ def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Pat
     few_rays = replace(
         settings, samples=SAMPLES, max_depth=min(settings.max_depth, 2), diffuse_reflection=False
     )
-    # Scene files contain only Lambertian patterns, so the constants are given again.
+    # Scene files contain only Lambertian patterns, so the materials are passed explicitly.
     constants = {name: materials[name] for name in scene.materials}
     written = read_scene(target, tracer.frequency, {names[name]: item for name, item in constants.items()})
     antennas = tracer.solver.tx_antenna, tracer.solver.rx_antenna
