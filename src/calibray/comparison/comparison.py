@@ -60,7 +60,7 @@ class Comparison:
     Attributes:
         name: Name of the problem.
         methods: The methods, in the order requested.
-        runs: Runs by name of the method, one run per seed.
+        runs: Runs by name of the method, one per seed.
         optimum: Lowest known objective [dB].
         found_by: The search that found the optimum.
     """

@@ -185,7 +185,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities from every method, the true values, and the paper's values for its own site."""
+    """Permittivities found by every method, the true values, and the paper's values for its own site."""
     columns = (
         Column("material"),
         Column("before"),

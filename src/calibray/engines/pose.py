@@ -141,7 +141,7 @@ def pose_error(
             weights[FIELDS.index(parameter.field), chosen, number] = unit[parameter.field]
     if not weights.any():
         return None
-    # Links of one transmitter share their pose, so that its sines are computed only once.
+    # Links of one transmitter share their pose, so its sines are computed only once.
     keys = np.column_stack([*mounting.pose, transmitter.reshape(-1)])
     shared, of_link = np.unique(keys, axis=0, return_inverse=True)
     antenna = mounting.index[paths.link]

@@ -190,7 +190,7 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 def _pivot(offset: NDArray[np.float64]) -> float:
     """Smallest singular value of the quadratic kernel, projected onto the complement of the linear functions."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
-    # Weights of the points with which the values of every linear function sum to zero.
+    # Weights of the points for which the weighted sum of every linear function is zero.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
     return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])
 

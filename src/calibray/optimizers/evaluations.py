@@ -15,7 +15,7 @@ Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Function that maps residuals [n, m] to values [n]; a value must increase with the mean square of its residuals."""
 
 OBJECTIVE_TOLERANCE = 1e-4
-"""Largest accepted relative difference between a value and its computation from the residuals; allows for float32."""
+"""Largest accepted relative difference between a value and that computed from its residuals; allows for float32."""
 
 DECIMALS = 9
 """Number of decimals to which unit-cube coordinates are rounded before repeated points are merged."""

@@ -4,8 +4,8 @@ Local searches are cheap if the engine returns derivatives, and a batch of candi
 candidate. Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in
 progress. Because of slab resonances, RMSE is a multimodal function of the permittivities, so one starting point is not
 enough. A search that comes close to a better one is merged with it. A search that is too far behind the best one to
-catch up is abandoned, and its last point is kept as a further minimum (`minima`). Minima that fit nearly as well show
-how ambiguous the best one is. `descent.py` computes the steps.
+catch up is abandoned, and its last point is kept as another minimum (`minima`). Minima that fit nearly as well show how
+ambiguous the best one is. `descent.py` computes the steps.
 
 Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
 better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns. All
@@ -67,7 +67,7 @@ use all starting points, 14 runs ended above the lowest known minimum with a pat
 """
 
 RETURNS = 10
-"""Number of searches that must end in the best minimum before the method starts no further searches."""
+"""Number of searches ending in the best minimum after which the method starts no more searches."""
 
 LEVEL = 1e-4
 """Relative difference in mean square below which two minima are considered to fit equally well, as along a valley."""

@@ -104,7 +104,7 @@ def load_trace(digest: str) -> Paths | None:
 
 
 def _is_trusted(status: os.stat_result) -> bool:
-    """Whether a file belongs to the user or root and is not writable by others, because results depend on its paths."""
+    """Whether a file can be trusted: it belongs to the user or root, and others cannot write to it."""
     if not stat.S_ISREG(status.st_mode):
         return False
     if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders

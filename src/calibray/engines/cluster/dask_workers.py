@@ -37,8 +37,8 @@ MOST_DEATHS: Final = 4
 """Number of worker deaths on one chunk after which the run ends; the chunk is then probably too large."""
 
 FETCH_WAIT: Final = POLL
-"""Initial wait for the transfer of a finished answer [s]. The wait doubles with every further request, so that large
-answers arrive eventually. Dead workers are detected between requests.
+"""Initial wait for the transfer of a finished answer [s]. The wait doubles with every request, so that large answers
+arrive eventually. Dead workers are detected between requests.
 """
 
 Answered = Callable[[int], None]

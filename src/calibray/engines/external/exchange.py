@@ -183,7 +183,7 @@ def read_answer(
 
 
 def read_rays(path: Path, num_links: int) -> bytes:
-    """The response of a program that returns a ray table.
+    """Read a program's response, and check that it is a ray table.
 
     Raises:
         Unusable: The file is missing, not a regular file, or too large, or contains no ray table.

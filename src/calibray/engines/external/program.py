@@ -28,7 +28,7 @@ from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 
 PLACEHOLDERS: Final = ("{request}", "{response}")
-GUARD_WAIT: Final = 2 * KILL_TIME  # longest wait for a guard that kills its program [s]
+GUARD_WAIT: Final = 2 * KILL_TIME  # longest wait for a guard to kill its program [s]
 PREFIX: Final = "calibray-call-"  # prefix of the names of temporary folders of calls
 OWNER_FILE: Final = "owner.json"
 

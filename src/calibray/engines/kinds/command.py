@@ -70,7 +70,7 @@ class CommandSection(EngineSection):
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
-        """SHA-256 of the files in the study's folder that the command line names, by their names there."""
+        """SHA-256 of the files in the study's folder that the command line names, by name."""
         folder = study.source.resolve().parent
         files = {word: folder / word for word in self.command if exists(folder / word)}
         return {word: file_digest(file) for word, file in files.items() if file.is_relative_to(folder)}

@@ -39,11 +39,11 @@ class Recorded:
         problem: Fingerprint of everything that determines the engine's answers apart from the candidate.
         name: Name of the engine.
         progress: Called with "waiting", the number of answers received from other runs, and the number awaited.
-        program_files: SHA-256 of the files of the engine's program by name, if it has any.
+        program_files: SHA-256 of the files of the engine's program, by name, if it has any.
 
     Attributes:
-        hits: Number of candidates so far that required no RT call, because they were in the ledger or repeated a
-            candidate of their batch.
+        hits: Number of candidates so far that required no RT call, because they were in the ledger or occurred earlier
+            in their batch.
     """
 
     def __init__(

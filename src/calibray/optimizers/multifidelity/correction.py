@@ -10,8 +10,8 @@ Slab resonances cause many minima. A kernel that was fitted with wrong constants
 discrepancy and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
 constants, most of which differ from the present set in one or two constants. Each set is judged with the scale of the
 discrepancy that suits it best. Rounds alternate between the fitted kernel and the kernel at the mean of the prior. A
-round descends from the most likely sets and fits the kernel to the best results. It accepts a result that makes the
-answers more probable.
+round descends from the most likely sets and fits the kernel to the best results. It accepts a result only if it makes
+the answers more probable.
 
 A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
 well and predict minima at different points; the lowest of these predictions would be too optimistic. A corrected model

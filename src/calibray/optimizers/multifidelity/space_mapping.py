@@ -1,9 +1,9 @@
 """Space mapping minimises an expensive model with the help of a cheap one, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
-The first call is at the minimum of this approximation. After every call, the cheap model is corrected until it agrees
-with all answers (`correction.py`). Many local searches then find its minima in all basins. There are two kinds of
-steps:
+The first call evaluates the minimum of this approximation. After every call, the cheap model is corrected until it
+agrees with all answers (`correction.py`). Many local searches then find its minima in all basins. There are two kinds
+of steps:
 
 - *exploitation*: of the minima of the corrected model within a trust region, the one with the lowest expected mean
   square is evaluated; the expectation includes the uncertainty. The trust region is a box around the best point. It is
@@ -206,7 +206,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """Minima of the uncorrected cheap model after the first `turn`, or else random points [count, d]."""
+        """Minima of the uncorrected cheap model without the first `turn`, and then random points [count, d]."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
