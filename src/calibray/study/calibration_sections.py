@@ -18,7 +18,7 @@ from calibray.support.strict_models import Section, Text
 
 
 class ObjectiveSection(Section):
-    """``[objective]``: combination of paths into a path loss, and treatment of links without a path.
+    """``[objective]``: how paths combine into a path loss, and how links without a path are treated.
 
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
@@ -53,8 +53,8 @@ class PriorSection(Section):
         spread: Standard deviation of the natural logarithm; 0.3 corresponds to about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the unit of the parameter. This key
             replaces `itu`, `value`, `like` and `spread`.
-        shared: Whether `std` is the spread of a population of transmitters. This spread is estimated if the spread of
-            the population is "auto".
+        shared: Whether `std` is the spread of a population of transmitters, which is estimated if the parameter's
+            `spread` is "auto".
     """
 
     itu: Text | None = None
@@ -179,7 +179,7 @@ TX_OFFSET: Final = "offset of the transmitter"
 """Name of the nuisance term with one offset per transmitter, used in predictions."""
 
 OF_ALL_LINKS: Final = " of all links"
-"""Suffix of the names of nuisance terms that are added for predictions and have one coefficient for all links."""
+"""Suffix of the names of nuisance terms added for predictions with one coefficient for all links."""
 
 
 class NuisanceSection(Section):
@@ -318,10 +318,10 @@ class MethodSection(Section):
 
 
 LARGEST: Final = 10**6
-"""Largest integer value of a setting. No method can store more candidates in memory."""
+"""Largest integer value of a setting; no method can hold more candidates in memory."""
 
 LONGEST: Final = 10**4
-"""Largest number of entries in a list and of characters in a string."""
+"""Largest number of entries in a list, and of characters in a string."""
 
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),
@@ -341,7 +341,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     """
     if not options:
         return
-    # Optimizers import SciPy; a study without options is read without them.
+    # Optimizers import SciPy, which a study without options does not need.
     from calibray.optimizers import METHODS, NO_OPTIONS
 
     settings = None
@@ -361,7 +361,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
-    """Check the type of a value against the annotation of the argument; types such as arrays are not checked."""
+    """Check a value against the type annotation of the argument; other types, such as arrays, are not checked."""
     types = [part.strip() for part in str(argument.annotation).split("|")]
     if not set(types) - {"None"} <= set(_TYPES):
         return

@@ -1,4 +1,4 @@
-"""All sections of a study file as a closed model, and checks for keys that cannot be combined."""
+"""All sections of a study file, and checks for keys that cannot be combined."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class StudyContent(Section, ABC):
         if value != VERSION:
             raise InputError(
                 f"this version of Calibray reads version {VERSION} of the study file; convert the file, or install a "
-                "Calibray that reads it"
+                "version of Calibray that reads it"
             )
         return value
 
@@ -137,18 +137,18 @@ class StudyContent(Section, ABC):
             )
         if self.engine.exports_rays and key is not None:
             raise InputError(
-                f"engine.rays = true: powers of rays are added and compared at one carrier, which excludes {key}; "
+                f"engine.rays = true adds and compares ray powers at one carrier, so it cannot be combined with {key}; "
                 "remove one of the two"
             )
 
     def _laws(self) -> dict[str, bool]:
-        """Whether parameters are coefficients of frequency laws."""
+        """Label for parameters that are coefficients of frequency laws, and whether there are any."""
         return {
             "coefficients of laws": any(split_name(name)[1].startswith("itu_") for name in self.parameters)
         }
 
     def _without_replay(self) -> dict[str, bool]:
-        """Keys that are incompatible with replay of power sums at one carrier, and whether each key is stated."""
+        """Keys that cannot be combined with replay of power sums at one carrier, and whether each is stated."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",

@@ -29,15 +29,15 @@ RECEIVER: Final = "rx:"
 """Prefix of the names of receivers' parameters."""
 
 AXES: Final = {"dx": 0, "dy": 1, "height": 2}
-"""Axis of the scene along which each field displaces an antenna."""
+"""Index of the coordinate (x, y, z) that each field changes."""
 
 LEAST: Final = 0.01
-"""Smallest distance of the outermost neighbour [m], so that knots at the bounds do not coincide."""
+"""Smallest displacement of the outermost knot [m]; it keeps knots distinct if a value is at its bound."""
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
 """Displacements on each side that are traced before the calibration, as shares of the largest displacement. For panels
 of eight rows and traced heights 2 m apart, the error of the interpolated path loss is 0.1 dB (median) and 2 dB (RMS).
-The RMS error of a parabola through both bounds of 8 m is 5 dB."""
+With a parabola through the stated height and bounds 8 m above and below it, the RMS error is 5 dB."""
 
 
 def displaces(name: str) -> bool:
@@ -58,8 +58,8 @@ class Displacement:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
         weights: 1 if a parameter displaces a group of links, otherwise 0 [G, parameters].
         group: Group of every link [L].
-        reach: Largest displacement of every group by one of its parameters [G], [m]; also the limit of sums of
-            displacements.
+        reach: Largest displacement of every group that a single parameter can cause [G], [m]; the sum over parameters
+            has the same limit.
         ground: The ground above which receivers keep their height; None if heights are not measured from the ground.
     """
 
@@ -80,7 +80,7 @@ class Displacement:
         return replace(links, **{end: position})
 
     def knots(self, values: NDArray[np.float64], neighbours: Sequence[float]) -> NDArray[np.float64]:
-        """Displacements of the links at which they are traced, ascending [2n + 1, L], [m].
+        """Displacements at which the links are traced, in ascending order [2n + 1, L], [m].
 
         Args:
             values: Values of the parameters [d] at which the displacement is 0.
@@ -114,7 +114,7 @@ def displacements(
     columns: Mapping[str, str | None],
     ground: Ground | None = None,
 ) -> tuple[Displacement, ...]:
-    """The displacements of links, one for each axis along which parameters displace links.
+    """One `Displacement` for each axis along which parameters displace links.
 
     Receivers of links without measured values have exact positions and are not displaced. `columns` contains the names
     of the columns of transmitters ("tx:") and devices ("rx:").
@@ -199,7 +199,7 @@ def displacement_loss(
 
     knots = np.array([each.knots(values, neighbours) for each in displacements])  # [K, 2n + 1, L]
     change_db = np.zeros(knots.shape)
-    # At its own position a link is not traced again: its change is zero.
+    # A link is not traced again at its own position, where its change is zero.
     moved = (knots != 0) & np.array([each.reach[each.group] > 0 for each in displacements])[:, None]
     if moved.any():
         axis, _, link = np.nonzero(moved)
@@ -231,7 +231,7 @@ def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
 
 
 def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes in path loss [K, 2n + 1, L], [dB]; without a path, the change at the next position inwards."""
+    """Changes in path loss [K, 2n + 1, L], [dB]; where no path arrives, that at the next position inwards."""
     change_db, middle = change_db.copy(), change_db.shape[1] // 2
     for step in range(1, middle + 1):
         for side in (1, -1):

@@ -1,6 +1,6 @@
 """Drafts a study from a scene and a table of links: TOML with the reason for every assumption as a comment.
 
-Names of columns, groups and files are user input. `study_text` quotes these names, so that none is interpreted as TOML.
+Names of columns, groups and files are user input. `study_text` quotes them, so none is interpreted as TOML.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ AVERAGING_WAVELENGTHS: Final = 40
 """Width of the cells over which fading is averaged [wavelengths] (Lee 1985; see `calibray.measurements.reading`)."""
 
 PLACE_SAMPLES: Final = 20
-"""Median number of samples at one position above which samples are averaged by position, as in a stationary scan. The
-logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
+"""Smallest median number of samples per position for which samples are averaged by position, as in a stationary scan.
+The logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
 """Smallest share of values equal to the lowest value that indicates clipping by the receiver."""
@@ -98,10 +98,7 @@ def _value(draft: LinksDraft) -> ValueColumn:
 
 
 def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
-    """Column of the EIRP or the transmitted power, by its key in ``[links]``; empty if there is no such column.
-
-    Tables of transmitters state the power of the whole carrier; a reference signal has only a part of this power.
-    """
+    """Column of the EIRP or the transmitted power, by its key in ``[links]``; empty if there is no such column."""
     power = column_names.find_transmit_power(draft.table.frame)
     if power is not None:
         return {"eirp_dbm" if column_names.matches(power, "EIRP") else "tx_power_dbm": power}
@@ -114,7 +111,7 @@ def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
 def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
     """The columns whose labels define the groups of the offset."""
     if value.quantity != "rsrp":
-        draft.assume("offset", "one for all links", "the values include cables and unknown antenna gains")
+        draft.assume("offset", "one for all links", "values include cable losses and unknown antenna gains")
         return []
     name = draft.section.get("transmitter")
     devices = transmitter_columns.find_devices(draft.table.frame)
@@ -161,7 +158,7 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
         floor, reason = float(column.min()), f"{100 * share:.0f} % of the values equal the lowest one"
     elif some_missing:
         floor, reason = float(np.floor(column.min())), f"{missing}, and none is lower"
-    # With a floor below that of the least sensitive device, powers that this device misses would count as too weak.
+    # The floor is that of the least sensitive device; powers that it misses can be above the floors of others.
     for name in transmitter_columns.find_devices(draft.table.frame):
         for device, values in column.groupby(draft.table.frame[name]):
             if values.notna().sum() < FEWEST_OF_DEVICE:
@@ -201,7 +198,7 @@ def _share_at_lowest(values: pd.Series) -> float:
 
 
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
-    """Average samples along tracks and at repeated positions; average by position if the scans are stationary."""
+    """Average samples of stationary scans or height profiles by position, and other dense samples in cells."""
     frame, name = draft.table.frame, draft.section.get("transmitter")
     heights = [] if rx.height is None else [rx.height]
     keys = [rx.x, rx.y, *heights, *draft.groups, *([name] if name and name not in draft.groups else [])]
@@ -212,7 +209,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
         return
     rows = f"{len(frame)} rows " + ("along a track" if draft.given.track else f"at {positions} positions")
     samples = int(frame.groupby(keys, dropna=False).size().median())
-    # Cells are areas in plan, and would average over the heights of a profile or of several storeys.
+    # A cell is an area in plan, so it would average over the heights of a profile or of several storeys.
     stacked = any(frame.groupby([rx.x, rx.y])[height].nunique().median() > 1 for height in heights)
     if draft.given.track is None and (samples >= PLACE_SAMPLES or stacked):
         few = samples < PLACE_SAMPLES
@@ -243,7 +240,7 @@ def _add_flight_times(draft: LinksDraft) -> None:
     draft.assume(
         "observables.flight",
         column,
-        f"by its name; the bias of {'each ' if bias != 'all' else ''}device is unknown",
+        f"by its name; the bias of {'each' if bias != 'all' else 'the'} device is unknown",
     )
 
 
@@ -267,10 +264,10 @@ class Draft:
 
 
 def draft(scene: str, links: str | Path, target: str | Path, given: Given | None = None) -> Draft:
-    """Draft a study from a scene, its XML file or `sionna:NAME`, and a table of links; no file is written.
+    """Draft a study from a scene (XML file or `sionna:NAME`) and a table of links, without writing files.
 
-    Files are named relative to the folder of `target`, the future study file. `given` contains what the user states in
-    addition.
+    File names in the study are relative to the folder of `target`, the future study file. `given` contains further
+    input of the user.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
@@ -290,7 +287,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
     if section.get("position") == "geographic" and not indoors:
         section["inside"] = "move"
         reason = "satellite positions have errors of metres, and some are inside buildings"
-        # Displaced receivers are averaged at one carrier.
+        # Powers at displaced receivers can be averaged only at one carrier.
         reason += "" if "frequency" in section else "; position_error_m models them"
         links.assume("links.inside", "move", reason)
     antenna_section = add_antennas(links)
@@ -369,7 +366,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
 
 
 def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The region of the trees next to the scene, and its parameter if trees are on the straight line of a link."""
+    """The region of trees from the file next to the scene, and its parameter if a link's straight line crosses it."""
     file = Path(links.scene).parent / TREES_FILE
     # Next to other scenes, a file of this name need not have the columns that `calibray scene` writes.
     if links.scene.startswith(BUNDLED) or read_frame(links.scene) is None or not exists(file):
@@ -540,7 +537,7 @@ def schema_text() -> str:
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of a study, with the first line of each docstring as a description."""
+    """The JSON Schema (draft 2020-12) of a study; the first paragraph of each docstring is a description."""
     content = Study.model_json_schema()
     _shorten(content)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Calibray study"} | {
@@ -549,7 +546,7 @@ def schema() -> dict[str, Any]:
 
 
 def _shorten(node: Any) -> None:
-    """Keep only the first line of each description. The other lines describe the attributes of Python classes."""
+    """Keep only the first paragraph of each description; the others describe attributes of Python classes."""
     if isinstance(node, dict):
         if isinstance(node.get("description"), str):
             node["description"] = node["description"].split("\n\n")[0].replace("\n", " ").replace("``", "")

@@ -44,8 +44,8 @@ RECEIVER_HEIGHT: Final = 1.5
 """Default height of a receiver without a column of heights [m], for a handheld phone."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn", "msnm"})
-"""Words in the names of altitude columns. Satellite receivers report altitudes above sea level; drones also report
-altitudes above ground."""
+"""Words in the names of altitude columns. These are ambiguous: satellite receivers report altitudes above sea level,
+and drones also report altitudes above ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
 """Default height of a transmitter without a column of heights [m], for a small cell on a mast."""
@@ -62,7 +62,7 @@ class Assumption:
     Attributes:
         what: Key of the study to which the assumption applies.
         value: The assumed value.
-        reason: The reason.
+        reason: Why this value is assumed.
     """
 
     what: str
@@ -72,7 +72,7 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Given:
-    """Input of a user in addition to the scene and the table of links.
+    """What the user states in addition to the scene and the table of links.
 
     Attributes:
         transmitters: Table of the transmitters' positions, unless the table of links contains them.
@@ -162,7 +162,7 @@ class LinksDraft:
         return self.transmitter_table.frame
 
     def assume(self, what: str, value: object, reason: str) -> None:
-        """Record an assumption. A second assumption of the same key replaces the value and adds a reason."""
+        """Record an assumption. A second assumption about the same key replaces the value and adds a reason."""
         earlier = next((entry for entry in self.assumptions if entry.what == what), None)
         if earlier is None:
             self.assumptions.append(Assumption(what, str(value), reason))
@@ -196,8 +196,8 @@ class LinksDraft:
         name = column_names.find_time(self.table.frame)
         if name is None:
             raise InputError(
-                f"{self.links}: no column of times ({self._columns()}), which {self.given.track} requires; name this "
-                "column 'time'"
+                f"{self.links}: no column of times ({self._columns()}), but {self.given.track} gives positions by "
+                "time; name the column of times 'time'"
             )
         self.section["track"] = {"file": self.relative(self.given.track), "time": name}
         rows = len(self.table)
@@ -256,7 +256,7 @@ class LinksDraft:
             self.sites = self.sites.select(np.isin(compared(self.sites.frame[key]), compared(names)))
 
     def _leave_out_unknown_transmitters(self, key: str, names_of_sites: pd.Series) -> None:
-        """Draft a filter that excludes rows with a transmitter that is not in the table of transmitters."""
+        """Draft a filter that excludes rows whose transmitter is not in the table of transmitters."""
         column, compared = self.table.frame[key], comparison(names_of_sites)
         lacking = ~np.isin(compared(column), compared(names_of_sites))
         if not lacking.any():
@@ -334,7 +334,7 @@ class LinksDraft:
         return [(self.links, self.table.frame), *([(sites, self.transmitter_rows)] if sites else [])]
 
     def _stated_frequency(self) -> tuple[float, str] | None:
-        """A carrier stated in a table [Hz] and its description; a column of carriers becomes ``links.frequency``."""
+        """A carrier stated in a table [Hz] and its source; a column of several carriers becomes `links.frequency`."""
         tables = ((*table, column_names.find_frequency(table[1])) for table in self._frequency_tables())
         stated = next(((file, rows, column) for file, rows, column in tables if column is not None), None)
         if stated is None:
@@ -344,7 +344,7 @@ class LinksDraft:
         if carriers[-1] - carriers[0] < SAME_CARRIER * carriers[0]:
             return float(np.nanmedian(values)), f"median of column {name}"
         read = rows[name].to_numpy(dtype=float) * column_names.find_frequency_unit(name)
-        # The unit of `links.frequency` is stated by the column's name; a guessed unit cannot be stated.
+        # The name of the column states the unit of `links.frequency`; a study has no key for a guessed unit.
         if np.array_equal(read, values, equal_nan=True) and len(carriers) <= MAX_CARRIERS:
             self.section["frequency"] = name
             self.assume("links.frequency", name, f"{len(carriers)} carriers in {file.name}")
@@ -352,9 +352,9 @@ class LinksDraft:
             return float(carriers[0]), f"lowest carrier of column {name}"
         if self.given.frequency is None:
             raise InputError(
-                f"{file}: column {name!r} has {len(carriers)} carriers; at most {MAX_CARRIERS} can be calibrated "
-                "together, in Hz or in the unit stated in the name of the column, such as frequency_mhz; "
-                "alternatively, give --frequency and a table of one carrier"
+                f"{file}: column {name!r} has {len(carriers)} carriers; a study can have at most {MAX_CARRIERS}, in Hz "
+                "or in a unit stated in the name of the column, such as frequency_mhz; alternatively, give --frequency "
+                "and a table of one carrier"
             )
         return float(np.nanmedian(values)), f"median of column {name}"
 
@@ -392,7 +392,7 @@ class LinksDraft:
     def _projected(
         self, rx: PositionColumns, tx: PositionColumns | None
     ) -> tuple[PositionColumns, PositionColumns | None]:
-        """The columns, as degrees or projected coordinates if this places most positions on the scene."""
+        """The columns, read as degrees or projected coordinates if this places most positions on the scene."""
         frame = self.frame if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
@@ -415,7 +415,7 @@ class LinksDraft:
         return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
 
     def _name_in_links(self, column: str | None) -> str | None:
-        """Name of a transmitter column in the links, renamed if the links have a column of the same name."""
+        """Name of a transmitter column in the links, changed if the links already have a column of this name."""
         taken = column in self.table.frame and column != self._transmitter_key
         return f"{self._transmitter_key}_{column}" if taken else column
 
@@ -447,7 +447,7 @@ class LinksDraft:
 
     @staticmethod
     def _unused_altitudes(frame: pd.DataFrame) -> str:
-        """Name a column of altitudes, which may be above sea level and is therefore not used; empty without one."""
+        """Hint that a column of altitudes is ignored, as it may be above sea level; empty without such a column."""
         unused = [str(name) for name in frame if column_names.words(name) & ALTITUDES]
         hint = "is ignored, because it may be above sea level; rename it 'height' if it is above the ground"
         return f" ({unused[0]} {hint})" if unused else ""

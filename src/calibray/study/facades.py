@@ -33,14 +33,14 @@ NEAR: Final = 0.5
 """Largest distance of a wall from its polygon [m]; walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance from a wall at which its two sides are distinguished [m]. Points at smaller distances are on the wall."""
+"""Distance from a wall at which its sides are told apart [m]; points closer than this are on the wall."""
 
 
 class FacadeSection(Section):
     """``[facades.NAME]``: a separate material for those parts of walls that meet all the stated criteria.
 
     Attributes:
-        of: Material of the scene with the surfaces that are divided. The new material has the same constants unless
+        of: Material of the scene whose surfaces are divided. The new material has the same constants unless
             ``[materials]`` states others.
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
@@ -119,7 +119,7 @@ def with_facade_materials(
 
 
 def without_facade_materials(scene: Scene, facades: Mapping[str, FacadeSection]) -> Scene:
-    """The scene without the materials of facades. Scenes are traced in this form."""
+    """The scene without the materials of facades, as it is traced."""
     if not facades:
         return scene
     materials, laws = (
@@ -177,7 +177,7 @@ def _applies(
         if not len(surfaces.walls):
             return np.zeros(len(point), dtype=bool)
         bearing, along, length, beside = _walls(surfaces, point)
-        # Neither ground nor roofs face a direction.
+        # The ground and roofs face no compass direction.
         applies &= beside < BESIDE
         if section.facing is not None:
             start, end = section.facing
@@ -199,7 +199,7 @@ def _applies(
             outline = outline[np.array(labels) == name.removesuffix(".0")]
             if not len(outline):
                 raise InputError(f"{file}: no polygon has {name!r} in its column {section.column!r}")
-        # Walls are on the outline itself, where a point may lie just outside.
+        # Walls are on the outline itself, so a point on a wall may lie just outside it.
         outlines += shapely.buffer(outline, NEAR).tolist()
     if outlines:
         area = shapely.union_all(outlines)
@@ -211,7 +211,7 @@ def _applies(
 def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """The wall nearest to each point in plan: bearing [deg], position along it (0 to 1), length [m] and distance [m].
 
-    Each is [n]. The compass bearing is that of the outward normal; the position starts at the west or south end.
+    Each array is [n]. The bearing is that of the outward normal; position 0 is the west or south end.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
     # In plan, an upright triangle is a line: from its first to its last corner in order of x and y.

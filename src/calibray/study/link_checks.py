@@ -41,7 +41,7 @@ CELL_SHARE: Final = 0.05
 """Largest width of averaging areas, as a share of the scene's shorter side."""
 
 HIGH: Final = 300.0
-"""Height above the whole scene [m]; greater heights are probably altitudes above sea level, read as heights above
+"""Height above the top of the scene [m]; greater heights are probably altitudes above sea level, read as heights above
 ground. Drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
 
 DOMINATED: Final = 0.5
@@ -51,8 +51,8 @@ dB, and 90 % intervals cover 86 % instead of 93 % of the links. With ten rows at
 changes."""
 
 SPREAD: Final = 5.0
-"""Width of the cells that contain the positions of a parked GPS receiver [m]. Phones are accurate to 4.9 m under an
-open sky (GPS.gov, GPS accuracy)."""
+"""Width of the cells in which GPS positions count as one, for example those of a parked car [m]. Phones are accurate to
+4.9 m under an open sky (GPS.gov, GPS accuracy)."""
 
 LOSSY: Final = 0.5
 """Mean gain [1] below which a table with a maximum of exactly 0 dBi probably contains relative gains."""
@@ -77,8 +77,8 @@ def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     There are no findings if only an external program can read the scene.
 
     Raises:
-        InputError: The engine is not an external program, and either all receivers or transmitters are far from the
-            scene or the scene cannot be read.
+        InputError: All receivers or all transmitters are far from the scene, or the scene cannot be read. With an
+            external program, no error is raised.
     """
     if find_spec("shapely") is None:
         problem = "positions were not checked against the scene: shapely is not installed"
@@ -140,7 +140,7 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
 def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Measurements) -> int:
     """Number of coefficients of a nuisance term, one per group.
 
-    A random effect has one, because only the mean is free.
+    A random effect counts as one, because only its mean is free.
     """
     if section.per is None or section.prior == "auto":
         return 1
@@ -176,7 +176,7 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
     cell = SPREAD if is_geographic else 0.01
     ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
-    # This is the number of positions if all are equally frequent, and nearly 1 if one position has nearly all rows.
+    # Equals the number of positions if all have equally many rows, and is nearly 1 if one has nearly all rows.
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
         within = f" within {cell:g} m" if is_geographic else ""
@@ -238,8 +238,8 @@ def _positions(
     elif beyond.any():
         row = links.row[int(np.argmax(overhead.outside(links.rx)))]
         yield (
-            f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where there is no ground and there "
-            f"are no buildings; the first is in row {row}",
+            f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where there is no ground and no "
+            f"building; the first is in row {row}",
             "leave out wrong positions with links.where, or create a larger scene",
         )
     if through_walls:
@@ -323,7 +323,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """Changes of the axes that reduce the number of misplaced receivers to at most a quarter, and this number."""
+    """The axis changes with the fewest misplaced receivers, and how many; None if more than a quarter of `wrong`."""
     if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -382,8 +382,8 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
     if below.mean() > 0.1:
         median = float(np.median(excess[below]))
         yield (
-            f"{int(below.sum())} of {len(links)} path losses are below free-space loss, by {median:.0f} dB in the "
-            "median",
+            f"{int(below.sum())} of {len(links)} path losses are below free-space loss, by a median of "
+            f"{median:.0f} dB",
             "check tx_power_dbm (30 dB: watts instead of milliwatts), gains included in the values, scene.frequency "
             "and the sign",
         )
@@ -423,7 +423,7 @@ def _angles(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
             yield (
                 f"the values fit antennas.{name} better with a yaw of {compass:.2f} rad: the standard deviation "
                 f"around a log-distance line is {spread_compass:.1f} dB instead of {spread:.1f} dB",
-                "yaw is measured from x (east) towards y (north); a compass bearing b is pi/2 - b",
+                "yaw is measured from x (east) towards y (north); a compass bearing b is a yaw of pi/2 - b",
             )
 
 

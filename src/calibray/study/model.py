@@ -77,7 +77,7 @@ class StudyModel(StudyContent, ABC):
         engine, other_engines = split_engine_keys(content.get("engine", {}), str(path))
         content = {**content, "engine": engine}
         try:
-            # From JSON, a list is accepted as a tuple, but nothing else is converted: "4" is not a number.
+            # Validation of JSON accepts a list as a tuple but converts nothing else: "4" is not a number.
             text = json.dumps(content, default=_plain)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
@@ -143,7 +143,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def observable_paths(self) -> dict[str, Path]:
-        """The files of the observables that are computed from files, by name of the observable."""
+        """The files of the observables that are computed from files, by observable name."""
         return {
             name: self._resolve(f"observables.{name}.file", section.file)
             for name, section in self.observables.items()
@@ -152,7 +152,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def region_paths(self) -> dict[str, Path | None]:
-        """The file of every region by name; None for a region of boxes."""
+        """The file of each region, by region name; None for a region of boxes."""
         return {
             name: section.source and self._resolve(f"regions.{name}.{section.source[0]}", section.source[1])
             for name, section in self.regions.items()
@@ -160,7 +160,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def facade_paths(self) -> dict[str, Path | None]:
-        """The file of every facade by name; None for a facade without a file."""
+        """The file of each facade, by facade name; None for a facade without a file."""
         return {
             name: None if section.file is None else self._resolve(f"facades.{name}.file", section.file)
             for name, section in self.facades.items()
@@ -196,7 +196,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states for materials of the scene, by name of the material."""
+        """The constants that ``[materials]`` states for materials of the scene, by material name."""
         return self._stated_constants(of_facades=False)
 
     def _stated_constants(self, of_facades: bool) -> dict[str, dict[str, Any]]:
@@ -208,12 +208,12 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def facade_constants(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states for facades, by name of the facade."""
+        """The constants that ``[materials]`` states for facades, by facade name."""
         return self._stated_constants(of_facades=True)
 
     @property
     def roughness_mm(self) -> dict[str, float]:
-        """Standard deviations of the surface height [mm] that ``[materials]`` states, by name of the material."""
+        """Standard deviations of the surface height [mm] that ``[materials]`` states, by material name."""
         stated = {name: material.roughness_mm for name, material in self.materials.items()}
         return {name: height for name, height in stated.items() if height is not None}
 
@@ -246,7 +246,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def priors(self) -> LogNormal:
-        """The priors of the parameters, by their indices in a candidate."""
+        """The priors, each with the index of its parameter in a candidate."""
         priors, linear = [], []
         for index, (name, entry) in enumerate(self.parameters.items()):
             if entry.prior is not None and entry.prior.std is not None:
@@ -288,7 +288,7 @@ class StudyModel(StudyContent, ABC):
             all_laws = {name: frequency_independent_law(material) for name, material in base.items()} | dict(
                 laws or {}
             )
-            # A parameter that is a coefficient of a frequency law needs its material's law.
+            # A coefficient of a frequency law needs the law of its material.
             needed = {item.material: all_laws[item.material] for item in items if item.field != item.constant}
             parameters = Parameters(items, frequency, needed)
             parameters.check_carriers([frequency])
@@ -409,12 +409,12 @@ class StudyModel(StudyContent, ABC):
 
 
 def _plain(value: object) -> Any:
-    """Numbers and arrays of NumPy as those of Python, and all else as text."""
+    """NumPy numbers and arrays as Python numbers and lists, and everything else as text."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def _keys_without_effect(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The keys of a valid study file that have no effect, each with the missing key that it requires."""
+    """The keys of a valid study file that have no effect, each with the missing key that it needs."""
     for section, keys in _NEEDED.items():
         for name, table in content.get(section, {}).items():
             for key, needed in keys.items():

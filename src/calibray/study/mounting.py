@@ -33,7 +33,7 @@ TR 38.901 are limited to 30 dB below the largest gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns with the antenna of a link, its direction, and the names of transmitters that parameters use."""
+    """The columns of the antennas and their directions, and of transmitter names if parameters refer to them."""
     columns = [name for section in study.links.mountings.values() for name in section.columns]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
@@ -65,7 +65,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
         yaw = np.arctan2(away[:, 1], away[:, 0])
         # Downtilt is positive downwards.
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
-    # A bearing is measured clockwise from north, yaw counter-clockwise from east; steering has the same sense.
+    # A bearing is measured clockwise from north, yaw counter-clockwise from east; steering turns like the azimuth.
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     if section.azimuth_from == "north":
@@ -82,8 +82,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     """Gain of the stated antennas of both ends along the straight line of each link [L], [dBi].
 
-    The gain at an end is 0 if all links have the same antenna and this has a Sionna RT pattern without a main
-    direction.
+    The gain at an end is 0 dBi if all links have the same antenna, with a Sionna RT pattern that has no main direction.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -111,7 +110,7 @@ def pose_effects(
     parameters: Parameters,
     paths: tuple[Paths, NDArray[np.int64]],
 ) -> Effects:
-    """Effects on paths of pose errors of transmit antennas, if there are parameters such as "tx:CELL.azimuth".
+    """The effects of antenna pose errors on paths; empty without parameters such as "tx:CELL.azimuth".
 
     `mountings` and `table` describe all links; `paths` contains the paths of selected links and the indices of these
     links.
@@ -171,7 +170,7 @@ def link_antennas(
 def _degrees(
     table: SourceTable, key: str, stated: float | str, limit: int, may_be_empty: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Angles [rows], [deg]. An empty cell in a row that may be empty [rows] counts as 0."""
+    """Angles [rows], [deg]. An empty cell counts as 0 in the rows that `may_be_empty` marks [rows]."""
     if isinstance(stated, str) and pd.api.types.is_numeric_dtype(column := table.column(stated)):
         table = table.assign(**{stated: column.mask(column.isna() & may_be_empty, 0.0)})
     values = table.numbers(stated)
@@ -183,7 +182,7 @@ def _degrees(
 
 
 def states_port_power(study: StudyModel) -> bool:
-    """Whether the power at the antenna port depends on an EIRP or a cable loss."""
+    """Whether the power at the antenna port is computed from an EIRP or a cable loss."""
     return study.links.eirp_dbm is not None or study.links.cable_loss_db is not None
 
 
@@ -234,7 +233,7 @@ is 0.29."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:
-    """The fields of transmitters with an estimated spread."""
+    """The transmitter fields whose spread is estimated."""
     return tuple(
         name.rpartition(".")[2] for name, entry in study.parameters.items() if entry.spread == "auto"
     )

@@ -15,7 +15,7 @@ from calibray.measurements.observables import FLIGHTS, KINDS, PROFILES, SECTORS,
 from calibray.support.strict_models import Section, Text
 
 UNITS: Final = {
-    # A distance is the time in which light travels it.
+    # A distance stands for the time that light takes to travel it.
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "m": 1 / speed_of_light},
     "dB": {"dB": 1.0},
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
@@ -30,7 +30,7 @@ class ObservableSection(Section):
 
     Attributes:
         kind: The measured quantity.
-        column: Column of the measured values; links without a value do not have this observable.
+        column: Column of the measured values; a link without a value lacks this observable.
         columns: Columns of the bins of a profile, instead of `column`.
         file: File of measured multipath components or impulse responses from which the values are computed, instead of
             columns.
@@ -38,7 +38,7 @@ class ObservableSection(Section):
         where: Row filter that selects the links with this observable; if absent, all links have this observable.
         compass: Whether azimuths in the file are compass bearings, clockwise from north.
         sample_rate: Sample rate of impulse responses without delays [Hz].
-        margin_db: Level above the noise at which samples of an impulse response are used [dB].
+        margin_db: Margin by which samples of an impulse response must exceed the noise to be used [dB].
         unit: Unit of the values: "s", "ms", "us", "ns", "ps" or "m" for times ("m" is the distance travelled at the
             speed of light), "dB" for levels, "rad" or "deg" for angles.
         std: Standard deviation of the error of a value, in `unit`; estimated if absent.
@@ -149,7 +149,7 @@ class ObservableSection(Section):
 
 
 def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, ObservableSection]:
-    """The sections. A section with several bins is split into one section per bin, named NAME_1, NAME_2, ...
+    """The sections, with those of several bins split into one section per bin, named NAME_1, NAME_2, ...
 
     Raises:
         InputError: Two sections have the same name.
@@ -165,7 +165,7 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
             parts = {
                 f"{name}_{number}": section.model_copy(update={
                     "column": column, "columns": (),
-                    # Both edges of this bin; the unused key of the two stays empty.
+                    # Both edges of this bin; the key that is not used stays empty.
                     "edges": section.edges[number - 1 : number + 1],
                     "edges_deg": section.edges_deg[number - 1 : number + 1],
                 })

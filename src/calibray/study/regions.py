@@ -60,15 +60,15 @@ class RegionSection(Section):
         boxes: Rectangles instead of a file: west, south, east, north [m] in the scene frame.
         position: "geographic" if the coordinates are in the reference system that the file states, "scene" if they are
             in the scene frame [m].
-        heights: "ground" for heights above the ground of the scene, as always for a canopy. If absent, heights are
-            above z = 0 of the scene.
+        heights: "ground" for heights above the ground of the scene, which always applies to a canopy. If absent,
+            heights are above z = 0 of the scene.
         bottom: Height of the bottom of the region: a number [m], or a column of the file, in metres or in the unit that
             the column name states.
         top: Height of the top of the region, in the same form; not allowed with a canopy.
         specific_attenuation: Loss per unit length of a short path inside the region, at the study's carrier [dB/m]; the
             start value if this is a parameter.
         frequency_exponent: Frequency exponent [1] of the specific attenuation, for links at other carriers.
-        maximum_db: Loss of a very long path inside the region [dB]; if absent, the value for woodland of ITU-R P.833.
+        maximum_db: Loss of a very long path inside the region [dB]; if absent, the ITU-R P.833 value for woodland.
     """
 
     file: Text | None = None
@@ -212,7 +212,7 @@ def _known(frame: Frame | None, path: Path) -> Frame:
 
 @dataclass(frozen=True)
 class Place:
-    """The data of a scene that regions require: its georeference, if known, and a function that reads its surfaces."""
+    """What regions need from a scene: its georeference, if known, and a function that reads its surfaces."""
 
     frame: Frame | None
     surfaces: Callable[[], SceneSurfaces]
@@ -265,7 +265,7 @@ def region_effects(
         np.add.at(length, path, regions[name].length_inside(start, end))
         effects.append(
             ExtraLoss(
-                # Attenuations are stated at the study's carrier; links may have other carriers.
+                # Paths at another carrier need the attenuation at that carrier.
                 length * (paths.frequency / frequency) ** section.frequency_exponent,
                 section.largest_loss_db(paths.frequency),
                 names.index(parameter) if parameter in names else None,

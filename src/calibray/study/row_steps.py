@@ -71,7 +71,7 @@ def row_steps(study: StudyModel) -> Preparation:
     inside = None if links.inside == "keep" else links.inside
     groups = [label for term in study.nuisance_terms.values() for label in term.per]
     groups += [item.bias for item in study.observables.values() if item.bias not in (None, "all")]
-    # A file names its links by this label.
+    # The file of an observable identifies links by this label.
     groups += [item.id for item in study.observables.values() if item.file is not None]
     # Columns computed from the scene are added to the links later.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
@@ -100,10 +100,8 @@ def row_steps(study: StudyModel) -> Preparation:
 def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> NDArray[Any]:
     """Labels [rows] of the parts of a table that are held out separately.
 
-    All labels are 0 if the parts depend on the links.
-
-    Parts that depend on the measured value or on columns of averages are determined from the links, after averaging and
-    merging.
+    All labels are 0 if the parts depend on the measured value or on columns that averaging adds. Such parts are
+    determined from the links, after averaging and merging.
     """
     table, none = replace(table, frame=table.frame.drop(columns=value, errors="ignore")), np.zeros(len(table))
     if holdout.by is not None:
@@ -115,7 +113,7 @@ def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> 
 
 
 def row_track(study: StudyModel) -> Track | None:
-    """The track that contains the positions of rows, or None."""
+    """The track with the positions of the rows, or None."""
     track = study.links.track
     return None if track is None else Track(str(study.track_path), track.time, track.longest_gap, track.clock)
 
@@ -206,7 +204,7 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
 
 
 def scene_place(study: StudyModel) -> Place:
-    """The data of the scene that regions and facades require."""
+    """What regions and facades need from the scene."""
     return Place(known_frame(study), partial(_surfaces, study.scene_source))
 
 

@@ -95,9 +95,9 @@ class AverageSection(Section):
     """``[links.average]``: averaging of nearby samples into one link, in linear power.
 
     Attributes:
-        by: "place" averages samples at equal receiver positions, "cell" in cells of a square grid, "distance" in
+        by: "place" averages samples at the same receiver position, "cell" in cells of a square grid, "distance" in
             intervals of the distance travelled in the order of the rows, and "time" in time windows.
-        size: Width or length of an average [m], or duration [s]; required except for "place".
+        size: Width of a cell or length of an interval [m], or duration of a window [s]; required except for "place".
         time: Column of times; only for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
         minimum_count: Smallest number of samples in an average; averages over fewer samples are excluded.
@@ -159,7 +159,7 @@ class MountingSection(Section):
         electrical_downtilt_deg: Downward shift of the pattern in the frame of the antenna, or of the beam of an array
             [deg]; a number or a column.
         steering_deg: Azimuth to which the beam of an array is steered electrically, relative to the antenna [deg]; a
-            number or a column. This azimuth is clockwise if azimuths are compass bearings.
+            number or a column. It is measured clockwise if azimuths are compass bearings.
         aim: "other end" points every antenna at the other end of its link, instead of azimuth and downtilt.
     """
 
@@ -297,7 +297,7 @@ class LinksSection(Section):
         if self.below_floor == "censor" and self.average is not None:
             raise InputError(
                 "links.below_floor = 'censor' with [links.average]: averages already include samples below the noise "
-                "floor, at half of its power; remove one of these keys"
+                "floor, at half its power; remove one of these keys"
             )
         return self
 

@@ -72,7 +72,7 @@ class Setup:
         links: All links of the study, including the held-out links.
         scene: The scene with the start values of the parameters, because the rays that the tracer launches depend on
             the materials.
-        parameters: The parameters for which a candidate contains values.
+        parameters: The parameters, in the order of the values of a candidate.
         held_out: Mask of the held-out links [L].
         factory: Function that opens the scene in a ray tracer.
         placed: Values of the parameters at which paths are traced, if parameters displace antennas; start values if
@@ -149,7 +149,7 @@ class Setup:
         return self._with_tracer(replace(self, parameters=parameters))
 
     def with_obstruction(self) -> Setup:
-        """The setup with links that have the columns computed from the scene (`obstruction.COLUMNS`)."""
+        """The setup with the columns that are computed from the scene added to its links (`obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
             self.links,
@@ -235,7 +235,7 @@ class Setup:
 
     @property
     def radio(self) -> RadioSettings:
-        """Carrier, bandwidth, combining of paths, antennas and observables."""
+        """Carrier, bandwidth, combination of paths, antennas and observables."""
         study = self.study
         wanted = tuple(section.wanted(name) for name, section in study.observables.items())
         return RadioSettings(
@@ -248,10 +248,7 @@ class Setup:
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antennas of an engine that exports rays; None if not stated in the study.
-
-        The result is also None if the antennas differ between links.
-        """
+        """Transmit and receive antennas of an engine that exports rays; None if unstated or different between links."""
         section = self.study.antennas
         known = section != AntennasSection() if section.known is None else section.known
         return self.radio.antennas if known and not self.study.links.mountings else None
@@ -329,7 +326,7 @@ class Setup:
     def trace(
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
-        """The paths of the links, which are traced, cached, or obtained from a ray table or external program.
+        """The paths of the links: traced, read from the cache, or obtained from a ray table or an external program.
 
         A program that returns rays is called once. Links that differ only in carrier are traced once. `materials`
         replace those of the scene, by name. `progress` is called with "tracing" after every launch.
@@ -351,7 +348,7 @@ class Setup:
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
-        # `select` keeps the order of the links, `unique` sorts them: `rank` is a pair's index among those selected.
+        # `select` keeps the order of links, but `unique` sorts pairs: `rank` is a pair's index among those selected.
         rank = np.argsort(np.argsort(first))
         return self._mounted(
             take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]), scene
@@ -366,7 +363,7 @@ class Setup:
 
     @cached_property
     def _ground(self) -> Ground | None:
-        """Function for the height of the lowest surface, or +inf; None if heights are not above ground."""
+        """Function that returns the height of the lowest surface, or +inf; None if heights are not above ground."""
         return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property
@@ -385,9 +382,9 @@ class Setup:
         return errors
 
     def with_position_noise(self) -> Setup:
-        """The setup with links weighted by the noise due to position errors. Without such errors, it is the same setup.
+        """The setup with link weights that account for position errors; without such errors, the setup itself.
 
-        The noise is the standard deviation of path loss over displaced receivers at the start values.
+        The additional variance is that of path loss over displaced receivers at the start values.
         """
         errors, links, study = self._position_error_m, self.links, self.study
         if errors is None:
@@ -492,7 +489,7 @@ def _scene_of(study: StudyModel, frequency: float) -> Scene:
 
 
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
-    """The paths of the study's ray table, with powers that are valid at the start values."""
+    """The paths of the study's ray table, whose powers are those at the start values."""
     from calibray.engines.rays.compile import RaySetting, compile_rays
     from calibray.engines.rays.table import RayTable, read_ray_file
 
@@ -501,7 +498,7 @@ def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material])
 
 
 def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
-    """The paths that the study's program returns, with powers that are valid for `materials`."""
+    """The paths that the study's program returns, whose powers are those with `materials`."""
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})

@@ -50,12 +50,12 @@ class Study(StudyModel):
     Attributes:
         version: Version of the file format.
         scene: The scene and the carrier.
-        objects: Patterns of object names, by name of the material that is created for these objects.
-        materials: Constants that replace those of the scene, by name of the material.
+        objects: Patterns of object names, by the name of the new material of these objects.
+        materials: Constants that replace those of the scene, by material name.
         links: The measured links.
         antennas: The antennas.
         trace: Settings of the ray tracer.
-        objective: Combination of paths into a path loss, and treatment of links without a path.
+        objective: How paths combine into a path loss, and how links without a path are treated.
         parameters: The parameters by name, in the order of the values of a candidate.
         offset: The nuisance term "offset" in its short form; None without an offset.
         nuisance: Further nuisance terms by name; `nuisance_terms` contains all terms.
@@ -174,7 +174,7 @@ class Study(StudyModel):
         return links_from_table(table, group, links.frequency, steps=steps, tx=links.tx, rx=links.rx)
 
     def opened(self) -> Setup:
-        """The opened study, for which the links, the scene and the parameters are read (see `Setup.open`)."""
+        """Open the study: read its links, scene and parameters (see `Setup.open`)."""
         return Setup.open(self)
 
 
@@ -213,7 +213,7 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 VALUE: Final = "measured"
 AIR: Final = 1.1
-"""Largest permittivity of a material that counts as air; the lowest in ITU-R P.2040 is 1.26, of ceiling board."""
+"""Largest permittivity that counts as air; that of any other ITU-R P.2040 material is at least 1.26 (ceiling board)."""
 
 LARGEST_PERMITTIVITY: Final = 15.0
 """Default upper bound of a calibrated permittivity, more than twice the largest permittivity of a building material in
@@ -226,7 +226,7 @@ power at any permittivity."""
 
 
 def permittivity_bounds(materials: Mapping[str, Material]) -> dict[str, list[float]]:
-    """Default bounds of the permittivities, by name, of all materials but air and metal.
+    """Default permittivity bounds of all materials except air and metal, by material name.
 
     Ceiling board has a lower permittivity than other building materials, and wet ground a much higher one.
     """
@@ -287,7 +287,7 @@ def _write_live_study(
             f"{name}.relative_permittivity": {"bounds": default} for name, default in bounds.items()
         },
         **sections,
-        # What a section does not state remains that of the scene.
+        # What a section does not state remains as in the scene.
         "materials": materials | {name: _stated(materials.get(name, {}), own) for name, own in given.items()},
         "antennas": antennas | {"known": True, **sections.get("antennas", {})},
         "links": {"file": "links.csv", **ends, "value": VALUE, **power, **links},
@@ -295,7 +295,7 @@ def _write_live_study(
 
 
 def _stated(constants: Mapping[str, Any], given: Any) -> Any:
-    """The constants of a material in a scene, and those that are given instead, which may be those of ITU-R P.2040."""
+    """The constants of a material in a scene, replaced where the user gives constants or an ITU-R P.2040 material."""
     if not isinstance(given, Mapping):
         return given
     law = {"relative_permittivity", "conductivity"} if "itu" in given else set[str]()

@@ -43,7 +43,7 @@ def read_content(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8 text; save the file as UTF-8") from None
     except (ValueError, RecursionError) as error:
-        # In addition to malformed TOML: a number with thousands of digits, or lists nested thousands of levels deep.
+        # Besides malformed TOML: a number with thousands of digits, or lists nested thousands of levels deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
 
 
@@ -61,7 +61,7 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
         agrees = tomllib.loads(text) == _with_lists(content)
     except ValueError:  # a lone surrogate, which no TOML file can contain
         pass
-    # For any names in a table, the file must state exactly what was drafted.
+    # Whatever the names in a table, the file must state exactly what was drafted.
     if not agrees:
         raise InputError(
             "draft: the name of a column or group cannot be written in TOML; rename the column or group in the table"
@@ -94,7 +94,7 @@ def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
 
 
 def _commented(item: Any, reason: str | None) -> Any:
-    """An item with a one-line comment. Text after a line break in the comment would be read as TOML."""
+    """An item with a comment on one line; text after a line break would be read as TOML."""
     return item.comment(printable(reason)) if reason else item
 
 

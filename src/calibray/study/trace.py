@@ -69,7 +69,7 @@ def trace(
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna, in the same form.
-        materials: Constants by material name, which replace those of the scene or the start values of a study. With a
+        materials: Constants that replace those of the scene or the start values of a study, by material name. With a
             study or a `Scene`, each value must be a `Material`.
         progress: Called with ("tracing", receivers traced, number of receivers) after every launch.
         **settings: The attributes of `TraceSettings`.
