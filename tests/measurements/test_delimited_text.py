@@ -107,5 +107,5 @@ def test_a_comma_that_may_separate_thousands_is_refused(tmp_path, mark):
 
 @pytest.mark.parametrize("cell", ["1,234,567", "1,234.5", "1.234,5", "1'234.5"])
 def test_separators_of_thousands_are_named(tmp_path, cell):
-    with pytest.raises(InputError, match=r"row 2, .* is not a number; remove the separators of thousands"):
+    with pytest.raises(InputError, match=r"row 2, .* is not a number; remove the thousands separators"):
         read(tmp_path, f"x;rssi\n{cell};-70\n7;-71\n").numbers("x")

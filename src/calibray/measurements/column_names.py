@@ -112,7 +112,7 @@ class ValueColumn:
     Attributes:
         column: Name of the column.
         quantity: The measured quantity.
-        reason: Reason for choosing the column.
+        reason: Why this column was chosen.
     """
 
     column: str
@@ -147,9 +147,9 @@ def words(name: object) -> frozenset[str]:
     # A time of flight must not be mistaken for a time of day.
     text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name).replace("\u03bc", "u"))
     text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
-    # The units of speeds and hours do not indicate a column of heights (h).
+    # The h in a unit of speed or time does not indicate a column of heights.
     text = re.sub(r"(?i)(?<![a-z])k?m\s*/\s*[hs](?![a-z])|[\[(]\s*h\s*[\])]", " ", text)
-    # Units with several capitals stay one word, such as "dBm".
+    # Units with several capitals, such as "dBm", stay one word.
     text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", text)
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     split = (re.split(r"[^a-z0-9]+", spelling.lower()) for spelling in (text, parts))
@@ -198,7 +198,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Hint at a column that matches a given row of `PATTERNS` but is not numeric; empty without such a column.
+    """Hint about a column that matches a given row of `PATTERNS` but is not numeric; empty without such a column.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
@@ -215,7 +215,7 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint at a longitude or latitude column that does not contain degrees; empty without such a column.
+    """Hint about a longitude or latitude column that does not contain degrees; empty without such a column.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
@@ -234,7 +234,7 @@ def no_degrees(frame: pd.DataFrame) -> str:
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns with the position of one end. Columns in metres take precedence over columns in degrees.
 
-    With `unnamed`, columns with names that indicate neither transmitter nor receiver can also belong to this end.
+    With `unnamed`, columns whose names indicate neither transmitter nor receiver can also belong to this end.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -277,8 +277,8 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values, and its quantity.
 
-    Path loss takes precedence over path gain, path gain over received power, and all of these over RSSI without a
-    decibel unit. The sign of the values distinguishes loss from gain.
+    Path loss takes precedence over path gain, path gain over received power, and all of these over RSSI in a column
+    whose name states no decibel unit. The sign of the values distinguishes loss from gain.
 
     Raises:
         InputError: No column appears to contain measured values.
@@ -293,7 +293,7 @@ def find_value(table: SourceTable) -> ValueColumn:
         if rank is None or matches(name, "another quantity"):
             continue
         if _is_plausible(without_codes(table.frame[name]), kinds[rank][1]):
-            # The power of a reference signal refers to a known bandwidth; RSSI contains interference.
+            # Powers of reference signals come first: they refer to a known bandwidth, but RSSI contains interference.
             secondary = rank == 2 and not matches(name, "reference signal")
             has_unit = matches(name, "decibel") or not secondary
             candidates.append((not has_unit, rank, secondary, name, kinds[rank][1]))
@@ -388,7 +388,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def no_frequency(frame: pd.DataFrame) -> str:
-    """Describe a column of carrier frequencies with values that are out of range; empty without such a column.
+    """Hint about a column of carrier frequencies whose values are out of range; empty without such a column.
 
     Example:
         >>> no_frequency(pd.DataFrame({"Frequency (Hz)": [1842.5]}))
@@ -413,7 +413,7 @@ def _frequency_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def find_time(frame: pd.DataFrame) -> str | None:
-    """Name of the first column with a name that indicates times, or None."""
+    """Name of the first column whose name indicates times, or None."""
     return _first([str(name) for name in frame], "time")
 
 
@@ -423,7 +423,7 @@ def find_distance(frame: pd.DataFrame) -> str | None:
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees. In some tables, columns named longitude and latitude are in metres."""
+    """Whether coordinates can be degrees; in some tables, columns named longitude and latitude are in metres."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 

@@ -23,7 +23,7 @@ SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
 """Extensions of text tables."""
 
 PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
-"""Texts that represent a missing number in a column of numbers."""
+"""Strings that represent a missing number in a column of numbers."""
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
@@ -38,7 +38,7 @@ _HEAD: Final = 64  # number of records from which the layout of a file is detect
 
 @dataclass(frozen=True)
 class _Layout:
-    """The layout of a table in a text.
+    """The layout of a text table.
 
     Attributes:
         separator: Column separator; a space represents any white space.
@@ -78,15 +78,15 @@ def read_text(path: Path) -> str:
 
 
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
-    r"""Read the rows of a table in a text, without blank lines.
+    r"""Read the rows of a text table, without blank lines.
 
     Lines above the header are skipped if they have a different number of cells or mostly empty cells. Units in a row
     below the header are appended to the column names. Columns of numbers can contain placeholders (`PLACEHOLDERS`) and
     the same decibel unit after every number.
 
     Args:
-        path: Name of the table in messages.
-        text: The text.
+        path: The file, for messages.
+        text: Content of the file.
         separator: Column separator; detected if None.
 
     Raises:
@@ -139,7 +139,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """Find the first line that can be the header of the rows below, and the separator with the most columns."""
+    """Find the first line that can be the header of the rows below, and the separator that gives the most columns."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
@@ -214,9 +214,9 @@ def _with_unit(name: object, unit: str) -> str:
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
-    """Convert texts to numbers if every text is a number, a number with the same decibel unit, or a placeholder.
+    """Convert strings to numbers if each is a number, a number with the same decibel unit, or a placeholder.
 
-    Leading and trailing white space is removed from other texts.
+    Otherwise, only leading and trailing white space is removed.
     """
     if not pd.api.types.is_string_dtype(column):
         return column
@@ -236,10 +236,10 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
     """The decimal mark of the numbers in a CSV text.
 
     Raises:
-        InputError: The decimal mark is not the same in all numbers, or could be a separator of thousands.
+        InputError: The decimal mark is not the same in all numbers, or could be a thousands separator.
     """
     lines: dict[str, int] = {}
-    # Cells such as 1,234 by column, and columns with whole numbers below 1000.
+    # The first cell such as 1,234 of each column, and the columns with whole numbers of at most four characters.
     unclear: dict[int, tuple[int, str]] = {}
     whole: set[int] = set()
     is_clear = False
@@ -264,13 +264,13 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
         line, cell = unclear[both[0]]
         raise InputError(
             f"{path}, row {line}: {cell!r} can mean {cell.replace(',', '.')} or {cell.replace(',', '')}, because its "
-            "column also contains numbers without a comma; remove separators of thousands, or write decimal points"
+            "column also contains numbers without a comma; remove thousands separators, or write decimal points"
         )
     return "," if "," in lines else "."
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Header of a CSV text and line number of each row; errors that pandas would silently correct are refused.
+    """Header of a CSV text and line number of each row; faults that pandas would silently correct are refused.
 
     The third result is whether every row ends with an additional empty cell.
 

@@ -37,7 +37,8 @@ MAX_PATTERN_LENGTH: Final = 200
 """Largest number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column for a pattern with a repetition; such a search takes 2 to 5 s."""
+"""Largest sum of squared text lengths in a column for a pattern with a repetition; at this limit, a search takes 2 to
+5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -82,14 +83,14 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse comparisons of a column of texts with numbers only, or of a column of numbers with texts only."""
+    """Refuse to compare a column of text with nothing but numbers, or a column of numbers with nothing but text."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
-        raise InputError("the column contains texts, which never equal a number; put the values in quotes")
+        raise InputError("the column contains text, which never equals a number; put the values in quotes")
     if kinds == {True} and pd.api.types.is_numeric_dtype(column.dtype) and column.notna().any():
         raise InputError(
-            "the column contains numbers, which never equal a text; remove the quotes around the values"
+            "the column contains numbers, which never equal text; remove the quotes around the values"
         )
 
 
@@ -124,17 +125,17 @@ TEXT_METHODS: Final[Mapping[str, Callable[..., pd.Series]]] = {
     "strip": _strip,
     "upper": lambda column: column.str.upper(),
 }  # fmt: skip
-"""The methods of a column of texts, after ``.str``."""
+"""The methods of a column of text, after ``.str``."""
 
 
 def _check_types(kind: type, **values: Any) -> None:
     for name, value in values.items():
         if not isinstance(value, kind):
-            raise InputError(f"{name} must be {'a text in quotes' if kind is str else 'True or False'}")
+            raise InputError(f"{name} must be {'text in quotes' if kind is str else 'True or False'}")
 
 
 def _affix(pat: Any, na: Any) -> Any:
-    """The checked prefix or suffix of a text, or a tuple of prefixes or suffixes."""
+    """The checked prefix or suffix of a string, or a tuple of these."""
     _check_types(bool, na=na)
     for text in pat if isinstance(pat, tuple) else (pat,):
         _check_types(str, pat=text)
@@ -143,7 +144,7 @@ def _affix(pat: Any, na: Any) -> Any:
 
 # The search for a pattern with several repetitions, or with a repeated group, may never end in practice. The allowed
 # patterns are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is
-# possessive, so that checking a pattern is cheap as well.
+# possessive, so checking a pattern is cheap as well.
 _CLASS: Final = r"\[\^?(?:\\.|[^\[\]\\])+\]"
 _CHARACTER: Final = rf"(?:\\[^0-9A-Za-z]|\\[bBdDsSwW]|{_CLASS}|[^\\^$*+?{{}}\[\]()|])"
 _ALTERNATIVE: Final = rf"\^?{_CHARACTER}*+[*+?]?{_CHARACTER}*+\$?"
@@ -159,18 +160,18 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
         re.compile(pattern)
     except (re.error, OverflowError) as error:
         raise InputError(
-            f"not a regular expression ({error}); set regex=False to search for a plain text"
+            f"not a regular expression ({error}); set regex=False to search for plain text"
         ) from None
     if not _PATTERN.fullmatch(pattern):
         raise InputError(
             "a pattern can contain only characters, classes, ^, $, | and one *, + or ? per alternative; set "
-            "regex=False to search for a plain text"
+            "regex=False to search for plain text"
         )
     # A match attempt at each position may run to the end of the text, so the cost is quadratic in its length.
     if _REPETITION.match(pattern):
         steps = float((column.dropna().astype(str).str.len().astype(float) ** 2).sum())
         if steps > MAX_SEARCH_STEPS:
-            raise InputError("the texts are too long for a pattern with a repetition; set regex=False")
+            raise InputError("the text is too long for a pattern with a repetition; set regex=False")
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
@@ -188,7 +189,7 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     if len(expression) > MAX_LENGTH:
         raise InputError(f"{len(expression)} characters, must be at most {MAX_LENGTH}; shorten it")
     code, backticked = _as_python(expression.strip())
-    # Python warns about escapes in texts, and pandas about groups in patterns; neither helps the author of a filter.
+    # Python warns about escapes in strings, and pandas about groups in patterns; neither helps the author of a filter.
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         result = _Interpreter(frame, code, backticked).value(_parse(code, frame))
@@ -197,7 +198,7 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     return result.to_numpy(dtype=bool, na_value=False)
 
 
-# Matches texts and backticked names, so that `&` and `|` are replaced only outside them.
+# Matches strings and backticked names, so that `&` and `|` are replaced only outside them.
 _TOKENS: Final = re.compile(
     r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|`(?P<column>[^`\n]+)`|(?P<sign>[&|])"""
 )
@@ -252,7 +253,7 @@ class _Interpreter:
         self._frame, self._code, self._backticked = frame, code, backticked
 
     def value(self, node: ast.expr) -> _Value:
-        """The value of a part of the filter: a column, or a single number, text or truth value."""
+        """The value of a part of the filter: a column, or a single number, string or truth value."""
         try:
             match node:
                 case ast.Name():
@@ -307,7 +308,7 @@ class _Interpreter:
 
     def _constant(self, node: ast.Constant) -> bool | int | float | str:
         if not isinstance(node.value, bool | int | float | str):
-            remedy = "use isna() or notna()" if node.value is None else "use a number, a text, True or False"
+            remedy = "use isna() or notna()" if node.value is None else "use a number, text, True or False"
             raise self._refusal(node, f"not allowed in a filter; {remedy}")
         if isinstance(node.value, int) and abs(node.value) > _MAX_INTEGER:
             raise self._refusal(node, f"the number is too large; it must be at most {_MAX_INTEGER}")
@@ -345,7 +346,7 @@ class _Interpreter:
             negative = isinstance(item, ast.UnaryOp) and isinstance(item.op, ast.USub)
             constant = item.operand if isinstance(item, ast.UnaryOp) and negative else item
             if not isinstance(constant, ast.Constant):
-                raise self._refusal(item, "must be a number, a text, True or False")
+                raise self._refusal(item, "must be a number, text, True or False")
             if constant.value is None and not negative:
                 values.append(None)
             else:

@@ -16,7 +16,7 @@ from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance below which transmitter and receiver are treated as coincident and path loss is undefined [m]."""
+"""Distance below which transmitter and receiver count as coincident, so path loss is undefined [m]."""
 
 FEW: Final = 8
 """Smallest number of links for estimating a trend, a noise model or a prediction error."""
@@ -39,8 +39,7 @@ class Measurements:
         limit_db: Largest measurable path loss [links], [dB]; None if unknown.
         censored: Mask [links] of the links below the noise floor, which have a path loss of at least `path_loss_db`;
             None if no link is censored.
-        table: The rows of the source table, used by filters and messages. If not given, there is one empty row per
-            link.
+        table: The rows of the source table, for filters and messages; by default, one empty row per link.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
@@ -193,7 +192,7 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that a filter holds out; at least one link, but not all.
+        """Mask [links] of the links that a filter holds out, which must be at least one but not all.
 
         Raises:
             InputError: The filter is not valid, or holds out no link or every link.
@@ -262,7 +261,7 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
 
 
 def _summary(links: Measurements) -> Table:
-    """Summary table of the links, with source, number and ranges of values."""
+    """Summary table of the links: source, number and ranges of values."""
     kind = "measured" if links.measured else "unmeasured"
     rows = [("number", f"{len(links):,} {kind}"), ("distance", _range(links.distance, "m"))]
     if links.measured:

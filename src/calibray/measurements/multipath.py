@@ -1,4 +1,4 @@
-"""Observables of links from measured multipath components, which are the delays, powers and angles of paths.
+"""Observables of links from measured multipath components: delays, powers and angles of paths.
 
 Each observable is the same statistic as in the model, except that components outside the dynamic range of the receiver
 are cut off sharply. If a link was measured several times, for example with a rotated array, the snapshots are averaged.
@@ -37,7 +37,7 @@ ANGLE: Final = {
 END: Final = {"departure": r"(^|_)([aze]od|departure|tx)(_|$)", "arrival": r"(^|_)([aze]oa|arrival|rx)(_|$)"}
 SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_|$)"
 ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
-"""Kinds of statistics that are computed from angles."""
+"""Kinds of statistics that need angles."""
 
 SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
@@ -57,7 +57,7 @@ class Multipath:
         snapshot: Label of the snapshot in which each component was measured [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
-        angles: Azimuths, counterclockwise from the x axis, and elevations or zenith angles [n], [rad], by plane and
+        angles: Azimuths, counter-clockwise from the x axis, and elevations or zenith angles [n], [rad], by plane and
             end, such as ("azimuth", "arrival").
     """
 
@@ -137,7 +137,7 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             if len(own) == 1:
                 values = table.numbers(own[0])
                 values = values if words(own[0]) & RADIANS else np.radians(values)
-                # Compass bearings run clockwise from north, the scene's azimuths counterclockwise from east.
+                # Compass bearings run clockwise from north, the scene's azimuths counter-clockwise from east.
                 angles[plane, end] = np.pi / 2 - values if compass and plane == "azimuth" else values
     return Multipath(
         labels,
@@ -232,7 +232,7 @@ DELAYS: Final = ("delay", "delays", "tau", "time", "t")
 """Names of the array of sample delays in a file [s]."""
 
 MARGIN_DB: Final = 10.0
-"""Margin above the mean noise power at which a sample is treated as signal [dB]. The power of noise samples is
+"""Margin by which a sample must exceed the mean noise power to be treated as signal [dB]. The power of noise samples is
 exponentially distributed, so one noise sample in 22,000 exceeds this margin."""
 
 
@@ -251,7 +251,7 @@ def read_impulse_responses(
             samples]. Alternatively, a folder with one file per link, [samples] or [snapshots, samples].
         labels: Labels of the links.
         sample_rate: Samples per second [Hz]; None if the files state delays [s].
-        margin_db: Margin above the mean noise power at which a sample becomes a component [dB].
+        margin_db: Margin by which a sample must exceed the mean noise power to become a component [dB].
 
     Returns:
         The samples above the threshold as components, with their powers.
@@ -388,7 +388,7 @@ def _check_size(file: Path, size: int) -> None:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Convert errors of a library to errors that name the file."""
+    """Convert errors raised by a library to errors that name the file."""
     try:
         yield
     except InputError:

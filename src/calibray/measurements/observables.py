@@ -38,22 +38,22 @@ KINDS: Final = {
 """Kinds of observables and the units of their values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are times. Measured times can contain a bias of the device."""
+"""Kinds that are travel times. Measured travel times can contain a bias of the device."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds that are fractions of the power of a link in a bin. Each bin is a separate observable."""
+"""Kinds that are the fraction of a link's power in a bin. Each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
-"""Kinds with measured values that can be negative: values in decibels, and times from a clock with a bias."""
+"""Kinds whose measured values can be negative: values in decibels, and times from a clock with a bias."""
 
 SHARE_RANGE_DB: Final = 30.0
 """Default dynamic range of the fraction of power in a bin [dB]."""
 
 ROUNDING: Final = 1e-12
-"""Tolerance within which a delay [s] or azimuth [rad] is at a limit, as for samples at multiples of 1 / bandwidth. The
-tolerance exceeds the rounding errors of differences of delays or azimuths, and is below the resolution of any
-receiver."""
+"""Tolerance within which a delay [s] or azimuth [rad] counts as equal to a limit, for example that of a sample at a
+multiple of 1 / bandwidth. It exceeds the rounding errors of differences between delays or azimuths, and is below the
+resolution of any receiver."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Statistic:
         return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
-        """Fractions of power in a bin [dB], increased by a constant fraction at the lower end of the dynamic range.
+        """Fractions of power in a bin [dB], plus the fraction at the lower end of the dynamic range.
 
         An empty bin therefore has a finite value both in the model and in the measurements.
 
@@ -114,7 +114,7 @@ class Wanted:
         name: Name of the observable in the study.
         statistic: The statistic.
         unit: Unit in which the program returns the statistic.
-        scale: Size of this unit in SI units.
+        scale: Value of this unit in SI units.
     """
 
     name: str

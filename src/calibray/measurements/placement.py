@@ -19,17 +19,15 @@ TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns with the position of a row on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
-"""The entry in `changes` for rows outside the times of a track. The entry also states a different time zone if this
-fits clearly better."""
+"""The entry in `changes` for rows outside the times of a track. If another time zone fits clearly better, the entry
+also states the `links.track.clock` for it."""
 
 MAX_FILE_SIZE: Final = 200_000_000
 """Size limit of a GPX file [bytes]. A track with one point per second reaches this size after three weeks."""
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
-    """Add the positions on a track to rows, interpolated linearly in time.
-
-    Rows outside the times of the track are left out.
+    """Add the positions on a track to rows, interpolated linearly in time; rows outside its times are left out.
 
     Times are texts in ISO 8601 (UTC unless a time zone is stated) or seconds since 1970. Altitudes are not used,
     because altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
@@ -98,7 +96,7 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
 def _covered(
     times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float
 ) -> NDArray[np.bool_]:
-    """Mask of rows between two successive track points with times that differ by at most `longest_gap`."""
+    """Mask of rows between two successive track points whose times differ by at most `longest_gap`."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
     # For a row at exactly the time of a point, the gaps next to this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
@@ -108,7 +106,7 @@ def _covered(
 
 
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
-    """Time-zone shift of the rows relative to the track [s]; 0 unless it places clearly more rows on the track.
+    """Time-zone shift of the rows relative to the track [s]; 0 unless a shift places clearly more rows on the track.
 
     Time zones are tested if at least a tenth of the rows are off the track. A shift must more than halve the number of
     these rows.
@@ -124,7 +122,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
 
 
 def _reason(error: Exception) -> str:
-    """The reason why pandas cannot read a time, without advice on arguments."""
+    """The reason why pandas cannot read a time, without its advice on arguments."""
     return first_line(error).partition(". You might")[0]
 
 
@@ -244,7 +242,7 @@ def _positions(
             ground = steps.ground(positions[:, 0], positions[:, 1])
         except InputError as error:
             raise InputError(f"{table.source}: {end}: {error}") from None
-        # The given heights are above the ground, not above the origin or sea level.
+        # The given heights are above the ground, not above z = 0 or sea level.
         positions[:, 2] = ground + height
     return positions
 

@@ -37,7 +37,7 @@ class LinkColumns:
 
     Attributes:
         tx: Transmitter position: x, y, z [m], or longitude, latitude [deg] and height [m].
-        rx: Receiver position, likewise.
+        rx: Receiver position, in the same form.
         value: Column of the measured values.
         quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for a received power with
             an unknown transmitted power. With "rsrp", the path loss is the negative of the received power, and an
@@ -85,11 +85,11 @@ class Averaging:
     """Averaging of samples, in linear power.
 
     Attributes:
-        by: Samples that are averaged together: samples at one "place" (equal receiver positions), in one "cell" of a
+        by: Samples that are averaged together: samples at one "place" (the same receiver position), in one "cell" of a
             square grid, in one interval of "distance" travelled (in the order of the rows), or in one window of "time".
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
-        unbiased: Whether to correct the bias in the logarithm of a mean over few samples.
+        unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
         minimum_count: Smallest number of samples in an average; averages over fewer samples are left out.
     """
 
@@ -105,7 +105,7 @@ class Track:
     """A GPX track from which the positions of rows are interpolated at their times.
 
     Attributes:
-        file: GPX file.
+        file: The GPX file.
         time: Column with the times of the rows.
         longest_gap: Longest time between two track points [s]; rows in longer gaps are left out.
         clock: Time by which the clock of the rows is ahead of the clock of the track [s].
@@ -135,13 +135,13 @@ class Preparation:
         unit_m: Unit of the position columns in the scene frame [m].
         ground: Function that returns the height of the ground; None if heights are not measured from the ground.
         averaging: How samples are averaged.
-        keep: Columns of labels of groups that are averaged separately, in addition to the transmitter column.
+        keep: Columns whose labels define groups that are averaged separately, in addition to the transmitter column.
         held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
             merged across parts.
         observables: Columns of additional measured values, which are averaged over the rows of a link.
         flights: Columns of times of flight, in which certain numbers can represent missing values.
-        computed: Functions that compute additional columns, by name of the column, after the columns of the
-            transmitters have been added. A function returns None if an optional column that it requires is missing.
+        computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
+            been added. A function returns None if an optional column that it requires is missing.
         inside: Treatment of receivers inside buildings: "drop", "move", or None to keep their positions.
         outside: Function that moves positions out of buildings; required with `inside`.
     """
@@ -169,7 +169,7 @@ class Preparation:
 
     @property
     def is_filter_only(self) -> bool:
-        """Whether a filter is the only step, so that the remaining rows are already links."""
+        """Whether there is no step other than a filter, so the remaining rows are already links."""
         steps = (
             *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
             *(self.averaging, self.inside),

@@ -1,6 +1,6 @@
 """Conversion of a table to links: reading the file, selecting, positioning, averaging or merging rows, and checks.
 
-Samples are averaged in linear power to one row per area or position. Along a street, the power fades by several dB
+Samples are averaged in linear power into one row per area or position. Along a street, the power fades by several dB
 within a wavelength. Ray tracing to a single point does not predict this fading, but it does predict the mean power over
 a few tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh.
 Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). Decibel values are not averaged, because their mean is 2.5 dB
@@ -52,7 +52,7 @@ def read_measurements(
     Args:
         path: The table: .csv, .parquet or .xlsx.
         tx: Transmitter position (x, y, z) [m] in the scene frame. Each coordinate is a number or the name of a column.
-        rx: Receiver position, likewise.
+        rx: Receiver position, in the same form.
         value: Column of the measured values.
         quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for
             a received power with an unknown transmitted power (see `LinkColumns`).
@@ -99,7 +99,7 @@ def measured_links(
 def _note_unused(
     table: SourceTable, chosen: SourceTable, steps: Preparation, columns: LinkColumns
 ) -> SourceTable:
-    """Record the transmitters and groups with chosen rows of which none remains in the table."""
+    """Record the transmitters and groups that have chosen rows, but no row left in the table."""
     groups = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     for name in dict.fromkeys([*groups, steps.transmitter]):
         if name not in table.frame or name not in chosen.frame:
@@ -156,8 +156,8 @@ the wrong column."""
 
 
 LINEAR: Final = 0.1
-"""Limit of the magnitude of received powers. If all powers in a table are below this limit, the unit is not dBm but,
-for example, watts."""
+"""If the magnitudes of all received powers in a table are below this limit, their unit is probably not dBm but, for
+example, watts."""
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
@@ -255,8 +255,8 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
 
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Largest uncertainty of an average due to samples below the noise floor; averages with a larger uncertainty are left
-out [dB]."""
+"""Largest uncertainty of an average due to samples below the noise floor [dB]; averages with a larger uncertainty are
+left out."""
 
 _AREA: Final = "calibray area"
 _PART: Final = "calibray part"
@@ -287,7 +287,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     averaging = steps.averaging
     if averaging is None:
         return table
-    # A gain or power rises with the linear power, a loss falls with it.
+    # A gain or power rises with the linear power; a loss falls with it.
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * table.numbers(columns.value)
     rx = [str(name) for name in columns.rx]
@@ -419,7 +419,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     first = ~pd.Series(link).duplicated().to_numpy()
     if first.all():
         return table
-    # A gain or power rises with the linear power, a loss falls with it.
+    # A gain or power rises with the linear power; a loss falls with it.
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * value
     # Powers are relative to the strongest row of each link, so that equal values remain equal to the last digit.
@@ -441,8 +441,7 @@ def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[n
 
 
 LEAST_STEP_DB: Final = 1.0
-"""Smallest effect of a label on the power that is recorded if rows with different labels in a column become one link
-[dB]."""
+"""Smallest effect of a label on the power [dB] that is recorded when rows with different labels become one link."""
 
 LEAST_RATIO: Final = 5.0
 """Smallest ratio of this effect to its standard error. One in two million labels exceeds this ratio by chance."""
@@ -459,7 +458,7 @@ def _note_steps(
     usable: NDArray[np.bool_],
     apart: Sequence[str],
 ) -> SourceTable:
-    """Record text columns, such as days, with labels that affect the power but are averaged into one link.
+    """Record text columns, such as days, whose labels affect the power but are averaged into one link.
 
     Each link is one observation of this effect, because the rows of a link can share errors.
 
@@ -500,7 +499,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions. Samples that differ in such a column are not averaged."""
+    """Columns that distinguish links at the same positions; samples that differ in one of them are not averaged."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]

@@ -43,7 +43,7 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 
 
 def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
-    """Apply the first steps of `select_rows`, which choose rows: `wide`, `track` and `where`."""
+    """Apply the steps of `select_rows` that choose rows: `wide`, `track` and `where`."""
     if steps.wide:
         table, _ = mask_codes(table, list(steps.wide), steps.missing)
         table = melt(table, steps.wide, value, steps.transmitter)
@@ -61,7 +61,7 @@ def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTab
 
 
 def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
-    """Apply the other steps of `select_rows`, which complete rows and leave out rows without a usable value."""
+    """Apply the other steps of `select_rows`, which complete rows and leave out those without a usable value."""
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
         # With a noise floor, a missing power was too weak to measure; without one, it carries no information.
@@ -144,11 +144,9 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column with the names of the transmitters in their table.
+    """The column with the names of the transmitters in their table; None unless exactly one column qualifies.
 
-    The values are distinct and include at least half of the given labels.
-
-    The result is None if no column or more than one column qualifies.
+    The values of such a column are distinct and include at least half of the given labels.
 
     Example:
         >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
@@ -164,7 +162,7 @@ def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str |
 
 
 def distinct_rows(transmitters: SourceTable) -> SourceTable:
-    """The rows of a table of transmitters without repetitions of equal rows."""
+    """The distinct rows of a table of transmitters."""
     return transmitters.select(~transmitters.frame.duplicated().to_numpy())
 
 
@@ -182,7 +180,7 @@ def repeated_label(transmitters: SourceTable, column: str) -> str:
 
 
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Add the columns of the table of transmitters to the links; the columns of names can have different names."""
+    """Add the columns of the table of transmitters to the links; its column of names need not be named `key`."""
     transmitters = distinct_rows(transmitters)
     label_of_link = table.labels(key).tolist()
     name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
@@ -241,7 +239,7 @@ sign."""
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
     """Find the codes for missing values among values [n], such as powers [dBm], in ascending order.
 
-    A number is a code if it is in `CODES`, is far from all other values, and either has the opposite sign or a
+    A number is a code if it is in `CODES`, is far from all other values, and has either the opposite sign or a
     magnitude above `largest`. For example, 100 is a code among powers, but a value among path losses.
 
     Example:

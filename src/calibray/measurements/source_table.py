@@ -125,7 +125,7 @@ class SourceTable:
             if str(value).strip().startswith(("<", "≤")):
                 remedy = "write the limit without this sign, and state links.noise_floor_dbm"
             elif re.fullmatch(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?", str(value).strip()):
-                remedy = "remove the separators of thousands"
+                remedy = "remove the thousands separators"
             raise InputError(f"{self.cell(first, source)}: {value!r} is not a number; {remedy}")
         numbers = parsed.to_numpy(dtype=np.float64, na_value=np.nan)
         unusable = np.isinf(numbers) if gaps else ~np.isfinite(numbers)
@@ -162,7 +162,7 @@ class SourceTable:
                 "label"
             )
         if pd.api.types.is_float_dtype(column):
-            # A label must not depend on other rows: if another row is empty or has 0.9, pandas stores 26 as 26.0.
+            # A label must not depend on other rows, but pandas stores 26 as 26.0 if another row is empty or has 0.9.
             return column.astype(str).str.removesuffix(".0").to_numpy(dtype=np.str_)
         return column.astype(str).to_numpy(dtype=np.str_)
 

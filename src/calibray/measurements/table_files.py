@@ -100,7 +100,7 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
 
 
 def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
-    """Number and cells of each row that is not blank, up to the last value, as computed values or formulas."""
+    """Number and cells, up to the last value, of each row that is not blank; cells are computed values or formulas."""
     import openpyxl
 
     # The file is opened here because openpyxl does not close files that it cannot read.
@@ -205,8 +205,8 @@ _decoded: Final[set[tuple[str | int, ...]]] = set()
 def read_table(path: str | Path) -> SourceTable:
     """Read a .csv, .txt, .tsv, .dat or .parquet file, or the first sheet of an .xlsx file, without blank lines.
 
-    The columns of a text are separated by commas, semicolons, tabs or spaces. If the separator is not a comma, numbers
-    can have decimal commas. See `parse_text` for the lines that are skipped.
+    The columns of a text file are separated by commas, semicolons, tabs or spaces. If the separator is not a comma,
+    numbers can have decimal commas. See `parse_text` for the lines that are skipped.
 
     Raises:
         InputError: The file does not exist, has a different extension, or is empty or malformed. The library that reads
@@ -238,7 +238,7 @@ def read_table(path: str | Path) -> SourceTable:
 @final
 @dataclass(frozen=True, eq=False)
 class PiecedTable:
-    """A table that is read in pieces, so that a large Parquet file is never loaded entirely.
+    """A table that is read in pieces, so a large Parquet file is never loaded entirely.
 
     Attributes:
         source: Name of the file.
@@ -374,7 +374,7 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
 def _open_parquet(path: Path) -> Any:
     from pyarrow import parquet
 
-    # The library terminates the process if damaged metadata contradict each other.
+    # The library terminates the process if damaged metadata contradicts itself.
     _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
         # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.

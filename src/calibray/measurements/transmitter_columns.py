@@ -111,7 +111,7 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
     """Find the column of transmitter names in the links, and the corresponding column in the table of transmitters.
 
-    Columns with a name that indicates transmitters are tried first, followed by other text columns.
+    Columns whose names indicate transmitters are tried first, followed by other text columns.
 
     Example:
         >>> links = pd.DataFrame({"gateway_id": ["a", "b", "a"], "rssi": [-80, -90, -85]})
@@ -129,9 +129,9 @@ def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[st
 
 
 def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
-    """Find the column with the names of transmitters that have positions in the same table.
+    """Find the column of transmitter names in a table that also contains the transmitter positions.
 
-    Each label in this column has a single position.
+    Each name has a single position.
 
     Example:
         >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
@@ -174,7 +174,7 @@ def find_transmitter_names(transmitters: SourceTable) -> list[str]:
 
 
 def find_devices(frame: pd.DataFrame) -> list[str]:
-    """Columns with values that can distinguish receiving devices."""
+    """Find the columns whose values can distinguish receiving devices."""
     quantities = (
         "x", "y", "longitude", "latitude", "height", "altitude or floor", "azimuth", "downtilt", "path gain", "power",
         "received power", "path loss", "decibel", "frequency", "bandwidth or shift", "time", "distance",
@@ -245,7 +245,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.boo
 
 
 def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | None:
-    """Column with the names of antenna models or files.
+    """Find the column with the names of antenna models or files.
 
     Of several columns, the one with the most `known` names is chosen.
     """
@@ -260,7 +260,7 @@ def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | 
 
 
 def plain_name(label: object) -> str:
-    """The name of an antenna in lower case, without punctuation and file extension.
+    """The name of an antenna in lower case, without punctuation or file extension.
 
     Example:
         >>> plain_name("80010677_0824 X-CO.MSI") == plain_name("80010677 0824_x_co")
@@ -273,7 +273,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Column of EIRP, or else of transmitted power [dBm], in a table of transmitters, by the key in ``[links]``."""
+    """Find the column of EIRP or else transmitted power [dBm] of transmitters, by its key in ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)

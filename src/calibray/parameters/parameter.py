@@ -66,7 +66,7 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
 physical bounds of each field."""
 
 ROUGHNESS: Final = "roughness_mm"
-"""Field of a material that represents an effect on paths instead of a constant."""
+"""Field of a material that is an effect on paths, not a constant."""
 
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
@@ -144,12 +144,12 @@ class Parameter:
 
     @property
     def material(self) -> str:
-        """The material's name."""
+        """The part of the name before the last dot: the material, or the effect and its label."""
         return split_name(self.name)[0]
 
     @property
     def field(self) -> str:
-        """The name of the field, one of `CONSTANT_OF_FIELD`."""
+        """The part of the name after the last dot."""
         return split_name(self.name)[1]
 
     @property
@@ -252,7 +252,7 @@ def start_value(
 
     Raises:
         InputError: The scene has no such material, the field has no effect with the scattering pattern of the material,
-            the start value is not finite, or `itu_material` raises the error.
+            the start value is not finite, or ITU-R P.2040 does not cover the material at this frequency.
 
     Example:
         >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
@@ -283,7 +283,8 @@ def itu_start(name: str, start: str, frequency: float, key: str = "start") -> fl
     Messages name the `key` of the study that states the value.
 
     Raises:
-        InputError: The text has a different form, the field has no ITU-R law, or `itu_material` raises the error.
+        InputError: The text has another form, or ITU-R P.2040 does not cover the field, or the material at this
+            frequency.
     """
     field = split_name(name)[1]
     if is_effect(name):

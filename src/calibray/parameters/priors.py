@@ -44,7 +44,7 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, and independent priors of further parameters with the same spread of the logarithm.
+        """These priors, and independent log-normal priors of further parameters with a common spread.
 
         The priors of scattering coefficients that are centred on 0 have the standard deviation `SCATTERING_SPREAD`.
         """
@@ -121,8 +121,7 @@ class LogNormal:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
         """Mean of the logarithm [n], and distance of each bound from this mean in standard deviations [n].
 
-        The last result is 1 if the search coordinate is the value, for which the mean of the logarithm is shifted. The
-        last result is 0 if the search coordinate is the logarithm.
+        The last result is 1 if the search coordinate is the value, which shifts the mean, and 0 if it is the logarithm.
         """
         item, spread = parameters.items[self.index[row]], self.spread[row]
         tilt = 0.0 if item.scale == "log" else 1.0

@@ -34,8 +34,8 @@ class _Law(NamedTuple):
 
     material: str
     constant: str
-    scale: int | None  # number of the parameter that is s; None if s is fixed
-    exponent: int | None  # number of the parameter that is e; None if e is fixed
+    scale: int | None  # index of the parameter that is s; None if s is fixed
+    exponent: int | None  # index of the parameter that is e; None if e is fixed
     fixed_scale: float
     fixed_exponent: float
 
@@ -146,8 +146,8 @@ class Parameters:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Constants that candidates determine at one carrier, and their derivatives, both [..., parameters].
 
-        If `frequency` is None, the carrier is that of the parameters. Both coefficients of a law have the same
-        constant.
+        If `frequency` is None, the carrier is that of the parameters. Both coefficients of a law get the constant that
+        they determine together.
 
         Raises:
             InputError: The candidates have the wrong length.
@@ -160,7 +160,6 @@ class Parameters:
                 np.asarray(law.fixed_exponent) if law.exponent is None else given[..., law.exponent],
                 self.frequency if frequency is None else frequency,
             )
-            # Both coefficients of a law have the constant that they set together.
             if law.scale is not None:
                 constants[..., law.scale], slopes[..., law.scale] = values.value, values.by_scale
             if law.exponent is not None:
@@ -188,7 +187,7 @@ class Parameters:
         return Parameters(tuple(constants.values()), frequency), np.array(indices, dtype=np.int64)
 
     def law_coefficients(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
-        """Both coefficients of every law with a coefficient among the parameters, by material.
+        """Both coefficients of every law that has a coefficient among the parameters, by material.
 
         Raises:
             InputError: The candidate has the wrong length.

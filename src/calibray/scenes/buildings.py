@@ -21,16 +21,16 @@ CELL: Final = 1.0
 depending on their position."""
 
 MAX_CELLS: Final = 8_000_000
-"""Largest number of raster cells, which limits memory use; larger scenes have wider cells."""
+"""Largest number of raster cells, to limit memory use; larger scenes have wider cells."""
 
 MAX_POINTS: Final = 2_000_000
 """Largest number of points along edges in memory at once."""
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number [n], from 0, of the building that contains each position [n, 3], [m], or is nearest to it in plan.
+    """Index [n] of the building that contains each position [n, 3], [m], or is nearest to it in plan.
 
-    All numbers are -1 if the scene consists only of ground.
+    All indices are -1 if the scene consists only of ground.
     """
     # Imported here because SciPy's spatial modules are slow to import and few users of this package need them.
     from scipy import ndimage
@@ -41,7 +41,7 @@ def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDA
         return np.full(len(position), -1)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cell = max(CELL, float(np.sqrt(np.prod(np.maximum(high - low, CELL)) / MAX_CELLS)))
-    # One additional cell, for corners at the upper bounds.
+    # Corners at the upper bounds need one additional cell.
     built = np.zeros(tuple(((high - low) / cell).astype(np.int64) + 1), dtype=bool)
     for point in _edge_cells((corners - low) / cell):
         built[point[:, 0], point[:, 1]] = True
@@ -57,7 +57,7 @@ def _edge_cells(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
     """Raster cells along the edges of triangles [F, 3, 2], in batches; successive cells of an edge are adjacent."""
     start = corners.reshape(-1, 2)
     step = np.roll(corners, -1, axis=1).reshape(-1, 2) - start
-    # Steps of at most one cell along each axis, so that an edge has no gaps.
+    # Steps are at most one cell along each axis, so an edge has no gaps.
     count = np.ceil(np.abs(step).max(axis=1)).astype(np.int64) + 1
     ends = np.cumsum(count)
     first = 0
@@ -88,7 +88,7 @@ def footprints(
     inside = (high > least - around).all(axis=1) & (low < most + around).all(axis=1)
     lying = (np.abs(normal[:, 2]) > LEVEL * area) & (area > 0)
     chosen = np.flatnonzero(lying & inside & ~triangles.ground)
-    # All faces are made counter-clockwise seen from above, so that a shared edge occurs once in each direction.
+    # With all faces counter-clockwise as seen from above, a shared edge occurs once in each direction.
     turned = normal[chosen, 2] < 0
     face = np.where(turned[:, None, None], corners[chosen][:, ::-1], corners[chosen])
     points = face.reshape(-1, 3)
@@ -108,7 +108,7 @@ def footprints(
 def _loops(faces: NDArray[np.int64]) -> list[list[int]]:
     """Closed lines around groups of faces that share edges; an edge shared by two faces is inside a group."""
     size = int(faces.max(initial=0)) + 1
-    # Each edge is encoded as one number, which sorts faster than a pair.
+    # Each edge is encoded as one number, because numbers are sorted faster than pairs.
     edges = np.unique(faces * size + np.roll(faces, -1, axis=1))
     starts, ends = np.divmod(edges, size)
     alone = ~np.isin(ends * size + starts, edges) & (starts != ends)

@@ -32,7 +32,7 @@ LINES: Final = 5000
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Vertical prisms over polygons; where prisms overlap, the length is counted once.
+    """Vertical prisms over polygons; length inside overlapping prisms counts once.
 
     Attributes:
         outline: Shapely polygons [n] in the scene's frame [m].
@@ -72,7 +72,7 @@ class Region:
         low, high = np.zeros(len(line)), np.ones(len(line))
         if self.ground is None:
             low, high = _between(start[line, 2], end[line, 2], self.bottom[prism], self.top[prism])
-        # Lines that miss a prism in height are dropped before the expensive intersection in plan.
+        # Lines above or below a prism are dropped before the expensive intersection in plan.
         near = high > low
         line, prism, low, high = line[near], prism[near], low[near], high[near]
         step = (end - start)[line]
@@ -243,7 +243,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
         for distance in (crossing(first[line], last[line], sides[face]),)
     ]
     crossed = np.concatenate([np.zeros((0, 2)), *crossings])
-    # Sorted by line, then by distance.
+    # Sort by line, then by distance.
     crossed = crossed[np.lexsort(crossed.T[::-1])]
     separate = np.ones(len(crossed), dtype=bool)
     separate[1:] = (np.diff(crossed[:, 0]) > 0) | (np.diff(crossed[:, 1]) > SAME_CROSSING)
@@ -433,7 +433,7 @@ def with_obstruction(
 
 
 def cluster_labels(position: NDArray[np.float64], side: float) -> NDArray[np.str_]:
-    """The grid square of every position [n, 3], [m], as "column row" [n]; squares have a given side length [m]."""
+    """The grid square of each position [n, 3], [m], as "column row" [n]; `side` is the side length of a square [m]."""
     return np.array([f"{column} {row}" for column, row in np.floor(position[:, :2] / side).astype(int)])
 
 

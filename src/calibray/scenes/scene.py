@@ -144,7 +144,7 @@ def read_scene(
     materials: dict[str, Material] = {}
     laws: dict[str, ItuLaw] = {}
     index: dict[str, int] = {}
-    originals: dict[str, str] = {}  # material in the file, by the material that the object gets
+    originals: dict[str, str] = {}  # material in the file, by name of the material that the objects get
     sizes: list[SurfaceSize] = []
     for shape in root.findall("shape"):
         sizes.append(SurfaceSize.of(read_surface(shape, path)))

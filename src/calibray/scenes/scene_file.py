@@ -233,10 +233,10 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
 
 
 def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
-    """Reduce a scene to the elements that a trace needs, so that Mitsuba reads no other elements.
+    """Reduce a scene to the elements that a trace needs, so Mitsuba reads no others.
 
-    Mitsuba would also load textures, emitters and sensors, and some malformed elements crash the process. These
-    elements have no effect on radio waves and are therefore dropped.
+    Mitsuba would also load textures, emitters and sensors. These have no effect on radio waves, but can crash the
+    process if they are malformed.
 
     Raises:
         InputError: The scene includes another file, or contains an element, a property or a parameter that Calibray

@@ -131,7 +131,7 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
     area, height = np.linalg.norm(normal, axis=1), corners[:, :, 2].mean(axis=1)
     level = np.abs(normal[:, 2]) > LEVEL * area
     steep = area * ~level
-    # Mean height of the walls: roofs over most of the scene are above it, the ground is below it.
+    # Mean height of the walls: roofs over most of the scene are above it, and the ground is below it.
     walls = float(np.average(height, weights=steep)) if steep.any() else np.inf
     extent = np.ptp(triangles.vertex[:, :2], axis=0)
     for number in np.unique(owner):
@@ -168,7 +168,7 @@ def ground_heights(
     """
     heights = np.full((len(y), len(x)), np.inf)
     corners = triangles.corners[triangles.ground]
-    # Grid points in the bounding box of each triangle, as (triangle, row, column).
+    # Grid points within the bounding box of each triangle, as (triangle, row, column).
     first = [_grid_index(axis, corners[:, :, k].min(axis=1), "left") for k, axis in enumerate((x, y))]
     last = [_grid_index(axis, corners[:, :, k].max(axis=1), "right") for k, axis in enumerate((x, y))]
     columns, rows = (end - start for start, end in zip(first, last, strict=True))

@@ -8,7 +8,7 @@ their vertices.
 A border has a wall at the heights at which a building stands on only one of its sides. Between buildings of different
 heights, the wall begins at the lower roof. Between buildings of equal height, there is no wall. All walls that meet at
 an end of a border use the same column of corners, so the surface is closed and its wedges are connected. Coordinates
-are whole millimetres, so that corners are either identical or clearly different.
+are whole millimetres, so corners are either identical or clearly different.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from calibray.scenes.meshes import MILLIMETRE
 from calibray.support.lazy_imports import library
 
 Interval = tuple[float, float, int]
-"""Bottom [m] and top [m] of a building, and its number."""
+"""Bottom [m] and top [m] of a building, and its index."""
 
 Length = TypeVar("Length", int, float)
 
 THINNEST: Final = GRID / 2
-"""Intervals thinner than this limit are rounding artefacts and are dropped [m]."""
+"""Smallest thickness of an interval [m]; thinner ones are rounding artefacts and are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
 
 
 def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Resolve overlaps in height: an overlap is assigned to the building with the higher top."""
+    """Assign heights where buildings overlap to the building with the higher top."""
     stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
         free = [(bottom, top, owner)]
@@ -126,7 +126,7 @@ WALL, WINDOW, ROOF, UNDERSIDE = range(4)
 Point = tuple[int, int]  # x, y [mm]
 Edge = tuple[Point, Point]
 Corner = tuple[int, int, int]  # x, y, z [mm]
-Stand = tuple[int, int, int]  # bottom [mm], top [mm], number of the building
+Stand = tuple[int, int, int]  # bottom [mm], top [mm], index of the building
 Strips = dict[Edge, list[tuple[Point, int]]]  # start and kind of each strip of an edge
 
 
@@ -167,7 +167,7 @@ class Windows:
         shares = np.cumsum([0.0, *([wall, window] * count)])
         points = np.rint(start + (end - start) * shares[:, None]).astype(int)
         strips = [((int(x), int(y)), (WALL, WINDOW)[index % 2]) for index, (x, y) in enumerate(points)]
-        # Drop strips that rounding reduced to nothing.
+        # Drop strips whose ends coincide after rounding.
         return [
             strip
             for strip, following in zip(strips, [*strips[1:], (edge[1], WALL)], strict=True)
@@ -181,7 +181,7 @@ class Shell:
 
     Attributes:
         corners: Corners of each triangle, counter-clockwise when seen from outside [F, 3, 3], [mm].
-        owner: Number of the building of each triangle [F].
+        owner: Index of the building of each triangle [F].
         kind: `WALL`, `WINDOW`, `ROOF` or `UNDERSIDE` [F].
     """
 
@@ -195,8 +195,8 @@ def extrude(
 ) -> Shell:
     """Extrude buildings from their cells, with heights in the scene's frame.
 
-    Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]. Bodies
-    that stand on the ground are open at the bottom, and all others are closed. Without `ground`, all bodies are closed.
+    Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]. A body
+    that stands on the ground is open at the bottom; any other body is closed. Without `ground`, all bodies are closed.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
@@ -254,7 +254,7 @@ def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int]
 
 
 def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
-    """Strips of all edges with a wall; both directions of an edge have the same corners."""
+    """Strips of all edges that have a wall; the two directions of an edge have the same corners."""
     if windows is None or windows.share == 0:
         return {}
     strips: Strips = {}

@@ -27,14 +27,14 @@ from calibray.support.output_files import exists
 _LOG: Final = logging.getLogger(__name__)
 
 OPENINGS: Final = frozenset({"door", "window"})
-"""Types that replace the wall on which they are drawn."""
+"""Types of segments that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
-"""Smallest and largest thickness of a wall [m]; other values suggest that the units of thickness and coordinates
-differ."""
+"""Smallest and largest thickness of a wall [m]; other values suggest that thickness and coordinates have different
+units."""
 
 USUAL_EXTENT: Final = (2.0, 300.0)
-"""Usual range of plan extents [m], outside which a warning recommends stating the unit; large halls are 300 m long."""
+"""Usual range of plan extents [m]; outside it, a warning recommends stating the unit. Large halls are 300 m long."""
 
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
@@ -98,7 +98,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
             are recognized, and a unit of length in a name, as in `width_cm`, applies to that column. The file can also
             be a DXF, GeoJSON or other vector file in the plan's coordinates. Its attributes must have exactly these
             names, with or without a unit. If there is no attribute type, the DXF layer is used as the type. Points and
-            texts in vector files are ignored.
+            text in vector files are ignored.
         height: Height of the top of segments without a height [m].
         unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file, or
             metres.
@@ -130,7 +130,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         bottom = 0.0 if np.isnan(bottom) else bottom
         extent = height - bottom if np.isnan(extent) else extent
         sides = [(tuple(a), tuple(b)) for part in parts for a, b in pairwise((part * unit).tolist())]
-        # The last point of an outline may be repeated.
+        # A file may repeat the last point of an outline.
         sides = [(a, b) for a, b in sides if np.hypot(b[0] - a[0], b[1] - a[1]) >= MILLIMETRE]
         if not sides or extent <= 0 or thickness <= 0:
             raise InputError(

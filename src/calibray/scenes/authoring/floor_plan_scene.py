@@ -53,10 +53,10 @@ WALL_THICKNESS: Final = 0.12
 """Thickness of a wall made of an ITU material if the plan states no thickness [m]."""
 
 STOREY: Final = 1.8
-"""Smallest height of a storey [m]; lower parts of walls, such as parapets, do not count as storeys."""
+"""Smallest height of a storey [m]; lower pieces of wall, such as parapets, do not count as storeys."""
 
 ROUNDING: Final = 2.0
-"""Largest distance [mm] by which rounding moves a corner at crossing walls away from the line of its wall."""
+"""Largest distance [mm] by which rounding moves the corner of two crossing walls off the line of either wall."""
 
 _REACH: Final = 0.03  # largest distance from a wall's face at which the end of another wall meets it [m]
 
@@ -195,7 +195,7 @@ def _extend(
         offset = end - other.start
         sine = outward[0] * along[1] - outward[1] * along[0]  # times the length of the other wall
         reach = (other.thickness or WALL_THICKNESS) / 2 + _REACH
-        # Nearly parallel walls are skipped, because their lines may cross far from where the walls meet.
+        # Nearly parallel walls are skipped, because their lines may cross far from the place where the walls meet.
         if abs(sine) < 0.1 * np.hypot(*along):
             continue
         step = (along[0] * offset[1] - along[1] * offset[0]) / sine
@@ -207,7 +207,7 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """Cut lines at crossings; on each piece, doors and windows replace walls, and shorter lines replace longer ones."""
+    """Cut lines at crossings. On each piece, doors and windows replace walls, and shorter lines replace longer ones."""
 
     def priority(number: int) -> tuple[bool, float, int]:
         return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number

@@ -2,7 +2,7 @@
 
 OpenStreetMap extracts are read with pyosmium, OpenStreetMap's own library. Pyosmium assembles multipolygon relations
 with holes by OpenStreetMap's rules, reads .osm and .pbf files, and returns all tags. GDAL's driver, in contrast,
-combines `building:levels` with other tags in one text. Nothing is downloaded.
+combines `building:levels` with other tags in one string. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _FEET_AND_INCHES: Final = re.compile(r"\s*(\d+)'\s*(\d+(?:\.\d+)?)\"\s*")
 
 @dataclass(frozen=True)
 class HeightRule:
-    """Assumptions for buildings whose height is not given.
+    """Assumptions for buildings without a stated height.
 
     Attributes:
         storey: Height of one storey [m].
@@ -119,7 +119,7 @@ class Footprints:
         height_from: Source of each top [n].
         part: Whether each outline is a part of a building [n]; parts take precedence over the outline of the whole
             building.
-        repairs: Number of buildings that were changed or left out, or have an unusable height, by reason.
+        repairs: Number of buildings that were changed, left out or given without a usable height, by reason.
     """
 
     polygon: NDArray[Any]
@@ -150,8 +150,8 @@ class Footprints:
 def clean_footprints(raw: Footprints) -> Footprints:
     """Prepare outlines for extrusion: round corners to a grid, remove self-intersections, and drop small outlines.
 
-    Corners are rounded to multiples of `GRID`; outlines with less area than `SMALLEST` are left out. Repairs
-    are counted. Repeated names are made unique.
+    Corners are rounded to multiples of `GRID`, outlines with an area below `SMALLEST` are left out, and repeated names
+    are made unique. Repairs are counted.
 
     Raises:
         InputError: A height is not a number or is above `HIGHEST`, or the buildings are farther apart than `WIDEST`.
@@ -325,11 +325,11 @@ def read_footprints(
             reference system.
         height: Column with the heights of the buildings above the ground, in metres or the unit in its name
             (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is interpreted
-            as the name. None if `columns` names a column with the numbers of storeys.
+            as the name. It can be None if `columns` names a column of numbers of storeys.
         columns: Additional columns.
         layer: Layer of the file, if it has more than one.
         frame: The scene's frame; by default a local frame centred on the footprints.
-        rule: Assumptions for heights that are not given.
+        rule: Assumptions for buildings without a stated height.
 
     Raises:
         InputError: The file does not exist, cannot be read, states no coordinate reference system, lacks a column or
@@ -356,7 +356,7 @@ def read_footprints(
         polygon=project(outlines, frame, crs),
         bottom=bottoms,
         top=np.select([has_height, has_levels], [tops, storeys * rule.storey], bottoms + rule.default),
-        # None, NaN and an empty text count as missing names.
+        # None, NaN and empty text count as missing names.
         name=tuple(
             f"building-{number}" if label in (None, "") or label != label else str(label)
             for number, label in enumerate(labels, start=1)
@@ -415,7 +415,7 @@ def _numbers(
 ) -> NDArray[np.float64]:
     """Read numbers [count] from a column, or repeat a constant; NaN where the column has no value.
 
-    Numbers are in metres, or in the unit stated in the name of the column. Texts are parsed as lengths.
+    Numbers are in metres, or in the unit stated in the name of the column. Text is parsed as a length.
 
     Raises:
         InputError: There is no such column, or a value in it is not a height.

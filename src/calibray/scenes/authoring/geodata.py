@@ -1,4 +1,4 @@
-"""Opening vector files and height models with a fixed list of drivers.
+"""Reading of vector files and height models with a fixed list of drivers.
 
 GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG). It chooses
 the driver by the content of the file. This module opens only formats without references to other files. A file is
@@ -44,7 +44,7 @@ TEXT_GROWTH: Final = 15
 
 HEIGHTS: Final = (-1000.0, 10_000.0)
 """Range of heights on land [m]; values outside this range, such as -32768, usually mark gaps that the file does not
-declare."""
+declare as such."""
 
 _MAGIC: Final = (
     (b"SQLite format 3\0", "GPKG"),
@@ -142,7 +142,7 @@ def _check_text_size(path: Path, what: str) -> None:
 
 def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
     pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
-    # An absolute path, so that no part of the name is interpreted as a GDAL prefix, such as /vsicurl or WFS:.
+    # In an absolute path, GDAL interprets no part of the name as a prefix, such as /vsicurl or WFS:.
     file = str(path.resolve())
     # DXF blocks can be nested, and nested blocks can expand from a few kilobytes to gigabytes.
     pyogrio.set_gdal_config_options({"DXF_INLINE_BLOCKS": False})
@@ -297,7 +297,7 @@ def open_height_model(path: Path) -> Iterator[HeightModel]:
 
 
 def _check_sidecars(path: Path) -> None:
-    """Refuse a model with auxiliary files that would change its heights, because these files are not read."""
+    """Refuse a model whose auxiliary files would change its heights, because these files are not read."""
     mask, auxiliary = Path(f"{path}.msk"), Path(f"{path}.aux.xml")
     if mask.exists():
         raise InputError(f"height model {path}: its mask {mask.name} is not read; write it into the GeoTIFF")

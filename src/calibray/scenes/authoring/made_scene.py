@@ -60,7 +60,7 @@ class SurfaceMaterial:
 
     Raises:
         InputError: The name is an ITU name or contains characters other than letters, digits, `_` and `-`; there is no
-            such ITU material; or the thickness is not greater than 0 and at most `THICKEST`.
+            such ITU material; or the thickness is not positive or exceeds `THICKEST`.
     """
 
     name: str
@@ -112,7 +112,7 @@ class Palette:
     Attributes:
         wall: Material of walls.
         window: Material of windows.
-        roof: Material of roofs and undersides. If None, they have the material of the walls, so that eaves diffract.
+        roof: Material of roofs and undersides. If None, they have the material of the walls, so eaves diffract.
         ground: Material of the ground.
     """
 
@@ -131,8 +131,8 @@ class MadeScene:
         frame: Geographic frame of the scene; None if unknown.
         bounds: West, south, bottom, east, north and top [6], [m].
         triangles: Number of triangles by material.
-        counts: Number of objects used, repaired or left out, by kind.
-        guessed: Buildings whose height is assumed, by the source of the assumption.
+        counts: Number of objects that were used, repaired or left out, by kind.
+        guessed: Names of the buildings whose height is assumed, by the source of the assumption.
         walls: Sentences that state how the lines of a floor plan were used.
     """
 
@@ -264,7 +264,7 @@ def make_scene(
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
     scene = MadeScene(folder / SCENE_FILES[0], frame, *extent(objects), counts, guessed)
     write_made_scene(scene, objects, materials, overwrite)
-    # If this scene replaces an older one, the trees of the older scene are removed.
+    # Remove the trees of an older scene that this scene replaces.
     (folder / TREES_FILE).unlink(missing_ok=True)
     if trees is not None and frame is not None and len(trees):
         trees.write(folder, frame)
@@ -282,7 +282,7 @@ def _ground_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[
     )
     lowest = np.full(len(footprints), np.inf)
     np.minimum.at(lowest, building, terrain.heights(*corners.T))
-    # The heights of parts are measured from the ground of the whole building, so that parts stand on each other.
+    # Parts are measured from the same ground as the whole building, so one part can stand on another.
     parts, wholes = np.flatnonzero(footprints.part), np.flatnonzero(~footprints.part)
     inside = shapely.point_on_surface(footprints.polygon[parts])
     part, whole = shapely.STRtree(footprints.polygon[wholes]).query(inside, predicate="within")

@@ -17,7 +17,7 @@ from calibray.scenes.authoring.geodata import open_height_model
 from calibray.scenes.meshes import Mesh
 
 MAX_POINTS: Final = 4_000_000
-"""Largest number of points in a ground sheet, which limits memory use."""
+"""Largest number of points in a ground sheet; it limits memory use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Terrain:
         northwest, northeast = self.z[row + 1, column], self.z[row + 1, column + 1]
         lower = southwest + u * (southeast - southwest) + v * (northeast - southeast)
         upper = southwest + v * (northwest - southwest) + u * (northeast - northwest)
-        # South-east of the diagonal, where u exceeds v, the cell is the lower triangle of `mesh`.
+        # South-east of the diagonal, where u exceeds v, a point is in the lower triangle of `mesh`.
         return np.where(u >= v, lower, upper)
 
     def mesh(self) -> Mesh:
@@ -107,7 +107,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
                 f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
                 f"around {centre.round(5).tolist()}; give a larger model, or lower the margin"
             )
-        # One additional cell on each side, for interpolation.
+        # Interpolation needs one additional cell on each side.
         first = np.maximum(np.floor([row.min() - 1, column.min() - 1]).astype(int), 0)
         last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
         last = np.minimum(last, [dataset.height - 1, dataset.width - 1])

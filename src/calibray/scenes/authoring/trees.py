@@ -152,7 +152,7 @@ def read_trees(path: str | Path, frame: Frame) -> Trees:
     if len(outline):
         outline = shapely.make_valid(project(outline, frame, WGS84))
         outline = np.where(narrow, shapely.buffer(outline, radius), outline)
-    # The crown of a low tree is half as high as the tree.
+    # The crown of a low tree begins at half the height of the tree.
     bottom = np.where(narrow, np.minimum(CLEARANCE, top / 2), 0.0)
     return Trees(outline, kind, bottom, top, np.array([height is None for height in heights], dtype=bool))
 
@@ -167,8 +167,8 @@ LEAST: Final = 2.0
 """Smallest height of vegetation that counts as trees [m], as in canopy models from laser scans."""
 
 STEP: Final = 1.0
-"""Step to which canopy heights are rounded [m], so that adjacent cells form polygons; canopy models have errors of
-metres."""
+"""Step to which canopy heights are rounded [m], so adjacent cells of equal height form one polygon; canopy models have
+errors of metres."""
 
 
 def read_canopy(
@@ -203,7 +203,7 @@ def read_canopy(
     classes = np.round(heights / STEP).astype(np.int32)
     a, b, c, d, e, f = (float(value) for value in tuple(affine)[:6])
     row, column = (int(value) for value in first)
-    # The transform of the part that was read, with the origin at the first cell of this part.
+    # The transform of the part that was read has its origin at the first cell of this part.
     window = type(affine)(a, b, c + a * column + b * row, d, e, f + d * column + e * row)
     polygons = [
         (shapely.from_geojson(json.dumps(shape)), value * STEP)

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 TOLERANCE: Final = 25.0
-"""Largest deviation from a straight line that rounding can cause, for collinear walls a few metres long [mm]."""
+"""Largest deviation from a straight line that rounding can cause in collinear walls a few metres long [mm]."""
 
 REACH: Final = 30_000.0
 """Largest gap between two collinear walls, such as the width of a street [mm]."""
@@ -48,7 +48,7 @@ class Alignment:
 
 
 def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignment:
-    """Align collinear walls; the triangles [F, 3, 3], [mm], are vertical or level.
+    """Align collinear walls among vertical and level triangles [F, 3, 3], [mm].
 
     Corners within `tolerance` [mm] of a straight line are moved onto this line, unless that would reverse an edge or a
     level triangle.
@@ -104,7 +104,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Number of the line of each edge, from 0; -1 for edges that are not collinear with any other edge [E].
+    """Index of the line of each edge; -1 for an edge that is not collinear with any other edge [E].
 
     Edges that share a corner are first joined into runs; then, nearby runs are joined into lines.
     """
@@ -151,10 +151,10 @@ def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArra
 
 
 def _group(segments: NDArray[np.float64], pairs: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Number of the line that each segment shares with others, from 0; -1 if it shares none [S]."""
+    """Index of the line that each segment shares with others; -1 if it shares none [S]."""
     line = np.full(len(segments), -1)
     closeness, count = tolerance, 0
-    # Short segments of an arc can form a chain that no line fits. Such a chain is retried with a smaller distance.
+    # Short segments of an arc can form a chain that no line fits; they are grouped again with a smaller distance.
     while len(pairs) and closeness > 1:
         pairs = pairs[_continues(segments, pairs, closeness)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(segments), len(segments)))

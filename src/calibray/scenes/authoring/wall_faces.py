@@ -1,4 +1,4 @@
-"""Merging of wall faces: a plan that shows both faces of each wall contains every wall twice.
+"""Merging of wall faces in plans that show both faces of each wall, and so contain every wall twice.
 
 Sionna RT models a wall as one sheet whose material has a thickness. `merge_faces` replaces two parallel lines of the
 same type, one wall thickness apart, with one sheet midway between them.
@@ -122,7 +122,7 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
         # Each pair covers this length on both of its lines.
         low, high = _span(segments[one], segments[other])
         faced[segments[one].kind] += 2 * (high - low)
-    # If a plan shows faces, nearly all of its length is paired; if it shows single lines, only a few walls are.
+    # If a plan shows faces, nearly all of its lines are paired; if it shows walls as single lines, only a few are.
     return {kind for kind in length if faced[kind] >= 0.5 * length[kind]}
 
 
@@ -171,7 +171,7 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 def _merge_pair(one: Segment, other: Segment) -> Segment:
     """The sheet between two overlapping faces; where the faces' ends are close, the sheet ends midway between them."""
     low, high = sorted(_relative(one, other)[0].tolist())
-    # At a corner, one face ends a wall's thickness before the other. The point midway between these ends is on the
+    # At a corner, one face ends one wall thickness before the other. The point midway between their ends is on the
     # centre line of the other wall.
     start = low / 2 if abs(low) <= THICKEST else max(low, 0.0)
     end = (high + one.length) / 2 if abs(high - one.length) <= THICKEST else min(high, one.length)
@@ -209,7 +209,7 @@ def _closes_wall(segment: Segment, pairs: Sequence[tuple[int, int]], segments: S
 
 
 def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
-    """Join sheets of one wall that are separated only by a crossing wall."""
+    """Join sheets of one wall that only a crossing wall separates."""
     joined: list[Segment] = []
     for sheet in sorted(sheets, key=lambda sheet: min(sheet.start, sheet.end)):
         for index, before in enumerate(joined):

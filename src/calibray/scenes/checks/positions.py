@@ -22,7 +22,7 @@ KERB: Final = 2.0
 """Height above the lowest point of a scene up to which objects, such as kerbs, do not count as buildings [m]."""
 
 CLEARANCE: Final = 0.05
-"""A surface counts as above an antenna if it is higher by more than this distance [m]."""
+"""A surface is above an antenna if it is higher by more than this distance [m]."""
 
 CONTACT: Final = 0.01
 """An antenna closer than this distance to a level surface counts as touching the surface [m]. At a distance of 1 mm,
@@ -255,14 +255,14 @@ def move_outside(
 
 
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
-    """The location of each point [n, 3], [m]: `BEYOND`, `UNDER` or `INSIDE`; empty in the open.
+    """The location of each point [n, 3], [m]: `BEYOND`, `UNDER`, `INSIDE`, or empty in the open.
 
     A point is inside a building if an upward vertical ray crosses an odd number of surfaces, as it does inside any
     closed body. The ground consists of the triangles marked in `Triangles.ground`.
     """
     if not len(triangles.face):
         return np.full(len(points), "")
-    # Sorted by x.
+    # `unique` sorts the points by x, as `vertical_crossings` requires.
     unique, inverse = np.unique(points, axis=0, return_inverse=True)
     corners = triangles.corners
     scene_low, scene_high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
@@ -275,6 +275,5 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
         np.add.at(ground_below, point, is_ground & ~above)
     beyond = ((unique[:, :2] < scene_low[:2]) | (unique[:, :2] > scene_high[:2])).any(axis=1)
     under = ((ground > 0) & (ground_below == 0)) | (unique[:, 2] < scene_low[2] - CLEARANCE)
-    # A line upwards from inside a closed body crosses its surface an odd number of times.
     location = np.select([beyond, under, over_building % 2 == 1], [BEYOND, UNDER, INSIDE], "")
     return location[inverse.reshape(-1)]

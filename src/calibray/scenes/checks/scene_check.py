@@ -42,7 +42,7 @@ class Finding:
             "note".
         subject: The object, material or file concerned; empty for the scene itself.
         problem: Description of the fault.
-        remedy: How to correct it.
+        remedy: How to correct the fault.
     """
 
     severity: Severity
@@ -60,12 +60,12 @@ class MeshFaults:
         material: Name of the object's material.
         vertices: Number of vertices.
         faces: Number of triangles.
-        open_edges: Edges that belong to one face only, even if vertices at the same position are merged.
-        unwelded_edges: Edges at which two faces meet without sharing vertices, so that no wedge is found.
-        crowded_edges: Edges shared by more than two faces, so that no wedge is found.
-        flipped_faces: Faces whose normals point inward, or opposite to those of their neighbours.
-        empty_faces: Faces with zero area.
-        repeated_faces: Faces with the same corners as another face.
+        open_edges: Number of edges of only one face, even after vertices at the same position are merged.
+        unwelded_edges: Number of edges at which two faces meet without sharing vertices, so no wedge is found.
+        crowded_edges: Number of edges shared by more than two faces, so no wedge is found.
+        flipped_faces: Number of faces whose normals point inward, or opposite to those of their neighbours.
+        empty_faces: Number of faces with zero area.
+        repeated_faces: Number of faces with the same corners as another face.
     """
 
     name: str
@@ -251,8 +251,8 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
     """For each face, the index of a parallel face that is closer than `CLOSE` to its centroid [F]; -1 if none.
 
     Faces are [F, 3, 3], [m]. Faces that rays cannot reach from outside get -1: walls between touching buildings, and
-    floors of buildings on the ground. They are recognized by the rule that a straight line from a point in the open
-    crosses an even number of faces.
+    floors of buildings on the ground. A side of a face is in the open if a straight line from it crosses an even
+    number of faces.
     """
     cover = np.full(len(corners), -1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -302,7 +302,7 @@ def count_faults(item: MeshObject) -> MeshFaults:
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
         open_edges=open_edges,
-        # Such an edge is open twice, once for each face.
+        # An unwelded edge is open twice, once for each face.
         unwelded_edges=max(0, (int((uses == 1).sum()) - open_edges) // 2),
         crowded_edges=int((uses_by_position > 2).sum()),
         flipped_faces=_count_flipped(mesh.vertices, mesh.faces[~empty], by_position[~empty]),
@@ -312,7 +312,7 @@ def count_faults(item: MeshObject) -> MeshFaults:
 
 
 def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The directed sides of all faces [3 F, 2], the edge index of each side [3 F], and the sides per edge [E]."""
+    """The directed sides of all faces [3 F, 2], the edge of each side [3 F], and the number of sides per edge [E]."""
     sides = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     _, edge, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
     return sides, edge.reshape(-1), uses
@@ -375,8 +375,8 @@ def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.i
     pairs = order[uses[edge[order]] == 2].reshape(-1, 2)
     one, other = pairs.T // 3
     same = (sides[pairs[:, 0]] == sides[pairs[:, 1]][:, ::-1]).all(axis=1)
-    # A graph with two nodes for each face: node f is the face as given, node count + f the face reversed. Links join
-    # the orientations of neighbours that agree, so all nodes of one component agree.
+    # The graph has two nodes for each face: f is the face as given, and count + f is the face reversed. Links join
+    # orientations of neighbours that agree, so all nodes of one component agree.
     links = np.concatenate(
         [
             np.column_stack([one, np.where(same, other, other + count)]),
