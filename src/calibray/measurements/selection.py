@@ -197,7 +197,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
         more = f" and {len(unknown) - MAX_LISTED} more" if len(unknown) > MAX_LISTED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
-            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add these, or remove these rows, "
+            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add them to that table, or remove these rows, "
             f'in a study with links.where = "`{key}` not in [{cells}]"'
         )
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]

@@ -333,12 +333,14 @@ def _indoors(links: LinksDraft) -> bool:
 
 
 def _depth(links: LinksDraft) -> int:
-    """Number of interactions: the walls on the straight lines of nearly all links, plus two reflections."""
+    """Largest number of interactions: the most walls on 95 % of the straight lines, plus two reflections."""
     measured = links.measurements()
     walls = int(np.quantile(count_crossings(links.overhead.walls, measured.tx, measured.rx), 0.95))
     lowest, highest = INDOOR_DEPTHS
     depth = int(np.clip(walls + 2, lowest, highest))
-    reason = f"straight lines cross up to {walls} walls; plus two reflections, within {lowest} to {highest}"
+    reason = (
+        f"straight lines cross up to {walls} walls; plus two reflections, limited to {lowest} to {highest}"
+    )
     links.assume("trace.max_depth", depth, reason)
     return depth
 
@@ -397,7 +399,7 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
         if indoors and conductivity > 0:
             bounds = [min(1e-3, float(f"{conductivity / 10:.0e}")), 3.0]
             entries[f"{name}.conductivity"] = {"bounds": bounds, "scale": "log"}
-    reason = "the scene's materials except metal; start values are those of the scene"
+    reason = "the scene's materials except metal and air; start values are those of the scene"
     links.assume("parameters", ", ".join(names), reason)
     return entries
 
@@ -456,7 +458,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     if folder is not None:
         reason = f"files of {folder.resolve().name}; the receiver's antenna is unknown"
     elif "azimuth_deg" in mount:
-        reason = "azimuths are stated: 3GPP sectors of 65 degrees and isotropic receivers"
+        reason = "azimuths are stated, so 3GPP sectors of 65 degrees and isotropic receivers"
     else:
         reason = "unknown; state the antennas and their orientations"
     if folder is None and name is not None:

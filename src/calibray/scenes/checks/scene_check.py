@@ -240,7 +240,8 @@ def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding
         else ""
     )
     problem = (
-        f"{len(covered)} faces are closer than {CLOSE:g} m to a parallel face (such as {one!r} and {other!r}){material}"
+        f"{len(covered)} faces are closer than {CLOSE:g} m to a parallel face (such as faces of {one!r} and {other!r})"
+        f"{material}"
         ": reflections may count twice, and paths through the faces may be lost"
     )
     severity: Severity = "warning" if differs.any() else "note"
