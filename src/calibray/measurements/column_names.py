@@ -277,8 +277,8 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values, and its quantity.
 
-    Path loss takes precedence over path gain, path gain over received power, and all of these over RSSI in a column
-    whose name states no decibel unit. The sign of the values distinguishes loss from gain.
+    Path loss takes precedence over path gain, and path gain over received power. Columns of RSSI whose names state no
+    decibel unit come last. The sign of the values distinguishes loss from gain.
 
     Raises:
         InputError: No column appears to contain measured values.

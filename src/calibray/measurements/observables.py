@@ -51,8 +51,8 @@ SHARE_RANGE_DB: Final = 30.0
 """Default dynamic range of the fraction of power in a bin [dB]."""
 
 ROUNDING: Final = 1e-12
-"""Tolerance within which a delay [s] or azimuth [rad] counts as equal to a limit, for example that of a sample at a
-multiple of 1 / bandwidth. It exceeds the rounding errors of differences between delays or azimuths, and is below the
+"""Tolerance within which a delay [s] or azimuth [rad] counts as equal to a limit. Samples at multiples of 1 / bandwidth
+can be at a limit. The tolerance exceeds the rounding errors of differences between delays or azimuths, and is below the
 resolution of any receiver."""
 
 

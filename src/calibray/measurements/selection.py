@@ -239,8 +239,8 @@ sign."""
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
     """Find the codes for missing values among values [n], such as powers [dBm], in ascending order.
 
-    A number is a code if it is in `CODES`, is far from all other values, and has either the opposite sign or a
-    magnitude above `largest`. For example, 100 is a code among powers, but a value among path losses.
+    A number in `CODES` is a code if it is far from all other values and has either the opposite sign or a magnitude
+    above `largest`. For example, 100 is a code among powers, but a value among path losses.
 
     Example:
         >>> find_codes([-70.0, 100.0, -200.0]), find_codes([70.0, 100.0, 130.0])

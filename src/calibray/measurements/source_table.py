@@ -32,7 +32,7 @@ class SourceTable:
         source: Name of the file, or another name of the table in messages.
         changes: Changes made by earlier steps, such as exclusion or averaging of rows, each with the number of affected
             rows.
-        joined: For each column from another table, the name of that table, the name of the column in it, and the column
+        joined: For each column from another table: the name of that table, the name of the column there, and the column
             of labels by which the tables were joined.
     """
 

@@ -1,7 +1,7 @@
 """Read tables from CSV, Parquet and Excel files.
 
 The first sheet of a workbook is converted to CSV text, so that one parser reads both formats. Sheets are read row by
-row, so a sheet with a single value in the last row and column does not require more memory than other sheets.
+row, so a single value in the last row and column of a sheet does not increase the memory needed.
 """
 
 from __future__ import annotations

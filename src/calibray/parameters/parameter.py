@@ -164,9 +164,9 @@ class Parameter:
 
 
 SCATTERING_SPREAD: Final = 0.25
-"""Standard deviation of the Gaussian whose positive half is the prior of a scattering coefficient that is 0 in the
-scene, if it is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et al., IEEE Trans.
-Antennas and Propagation 55, 2007)."""
+"""Standard deviation of a Gaussian. Its positive half is the prior of a scattering coefficient that is 0 in the scene,
+if the true value is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et al., IEEE
+Trans. Antennas and Propagation 55, 2007)."""
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:

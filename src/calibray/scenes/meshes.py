@@ -262,8 +262,8 @@ def _number(word: str) -> float:
 def ply_bytes(mesh: Mesh) -> bytes:
     """Encode a mesh as a binary little-endian PLY file; equal meshes give equal bytes.
 
-    Vertices are stored as 32-bit floats, or as 64-bit floats if rounding to 32 bits could cause errors of more than
-    about a tenth of a millimetre.
+    Vertices are stored as 32-bit floats, or as 64-bit floats if rounding to 32 bits could move them by more than about
+    0.1 mm.
     """
     # Single precision halves the file size; beyond 4 km, its spacing is 0.5 mm or more.
     is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 3e-4

@@ -91,9 +91,9 @@ class ParameterSection(Section):
             is used.
         scale: "linear" or "log".
         prior: Prior of the parameter; uniform within the bounds if absent.
-        spread: Standard deviation of the values of individual transmitters around the common value of a parameter such
-            as "tx:*.azimuth", in the unit of the parameter, or "auto" to estimate it. If absent, only the common value
-            is calibrated.
+        spread: Standard deviation of individual transmitters around the common value of a parameter such as
+            "tx:*.azimuth", in the unit of the parameter; "auto" to estimate it. If absent, only the common value is
+            calibrated.
     """
 
     bounds: tuple[float, float]

@@ -45,10 +45,10 @@ HIGH: Final = 300.0
 ground. Drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
 
 DOMINATED: Final = 0.5
-"""Effective share of the positions below which a few positions with many rows dominate the fit. In district 383, with
-60 rows at each of three of about 47 positions (an effective share of 10 %), prediction errors are 3.5 dB instead of 3.0
-dB, and 90 % intervals cover 86 % instead of 93 % of the links. With ten rows at every position (100 %), neither
-changes."""
+"""Effective share of the positions below which a few positions with many rows dominate the fit. In district 383,
+three of about 47 positions had 60 rows each (an effective share of 10 %). Prediction errors were 3.5 dB instead of 3.0
+dB, and 90 % intervals covered 86 % of the links instead of 93 %. With ten rows at every position (100 %), neither
+changed."""
 
 SPREAD: Final = 5.0
 """Width of the cells in which GPS positions count as one, for example those of a parked car [m]. Phones are accurate to

@@ -131,8 +131,8 @@ class Study(StudyModel):
         """Links without measured values, for prediction, with the groups of the offset.
 
         Args:
-            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene frame, as in
-                `result-links.csv`, or rows in the form of the study's table. No row is left out, and a row of a wide
+            table: Rows in the form of the study's table, or with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m]
+                in the scene frame, as in `result-links.csv`. No row is left out, and a row of a wide
                 table becomes one link per transmitter.
 
         Returns:

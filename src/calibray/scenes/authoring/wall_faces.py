@@ -54,8 +54,8 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     lines that close the outline of a wall are left out. If the walls of a type have no given thickness, their thickness
     is the median distance between their faces, weighted by length.
 
-    If less than half of the total length of a type's lines has an opposite face, each line of the type is treated as a
-    wall. Two lines that are close together are then separate walls, and both are kept.
+    If less than half of a type's total line length has an opposite face, each line of the type is treated as a wall.
+    Two lines that are close together are then separate walls, and both are kept.
 
     Returns the sheets, followed by the lines without an opposite face.
     """

@@ -324,10 +324,10 @@ def _count_flipped(
 ) -> int:
     """Count the faces with wrong normals.
 
-    The faces of each connected piece are first given a consistent orientation. The correct orientation is known if the
-    piece is closed or open only at its bottom (its signed volume must be positive), or if it is a horizontal sheet (its
-    normal must point up). For any other piece, such as a wall, either side may be outside, and the faces that differ
-    from the majority are counted.
+    The faces of each connected piece are first given a consistent orientation. The correct orientation is known for two
+    kinds of piece. The signed volume of a piece that is closed, or open only at its bottom, must be positive. The
+    normal of a horizontal sheet must point up. For any other piece, such as a wall, either side may be outside, and the
+    faces that differ from the majority are counted.
     """
     if not len(faces):
         return 0
