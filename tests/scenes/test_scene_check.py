@@ -192,6 +192,6 @@ def test_a_road_in_the_plane_of_the_ground_is_named(tmp_path):
                    and "parallel" in item.problem)  # fmt: skip
     assert finding.severity == "warning"
     assert (
-        "(such as 'mesh-road' and 'mesh-ground'), 2 of them to a face of a different material"
+        "(such as faces of 'mesh-road' and 'mesh-ground'), 2 of them to a face of a different material"
         in finding.problem
     )
