@@ -179,7 +179,7 @@ TX_OFFSET: Final = "offset of the transmitter"
 """Name of the nuisance term with one offset per transmitter, used in predictions."""
 
 OF_ALL_LINKS: Final = " of all links"
-"""Suffix of the names of nuisance terms added for predictions with one coefficient for all links."""
+"""Suffix of the names of nuisance terms that predictions add with one coefficient for all links."""
 
 
 class NuisanceSection(Section):

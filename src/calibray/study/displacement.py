@@ -231,7 +231,7 @@ def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
 
 
 def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes in path loss [K, 2n + 1, L], [dB]; where no path arrives, that at the next position inwards."""
+    """Changes in path loss [K, 2n + 1, L], [dB]; where no path arrives, the change at the next position inwards."""
     change_db, middle = change_db.copy(), change_db.shape[1] // 2
     for step in range(1, middle + 1):
         for side in (1, -1):

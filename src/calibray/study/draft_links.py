@@ -447,7 +447,7 @@ class LinksDraft:
 
     @staticmethod
     def _unused_altitudes(frame: pd.DataFrame) -> str:
-        """Hint that a column of altitudes is ignored, as it may be above sea level; empty without such a column."""
+        """Hint that a column of altitudes is ignored, because it may be above sea level; empty without one."""
         unused = [str(name) for name in frame if column_names.words(name) & ALTITUDES]
         hint = "is ignored, because it may be above sea level; rename it 'height' if it is above the ground"
         return f" ({unused[0]} {hint})" if unused else ""

@@ -132,8 +132,8 @@ class Study(StudyModel):
 
         Args:
             table: Rows in the form of the study's table, or with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m]
-                in the scene frame, as in `result-links.csv`. No row is left out, and a row of a wide
-                table becomes one link per transmitter.
+                in the scene frame, as in `result-links.csv`. No row is left out, and a row of a wide table becomes one
+                link per transmitter.
 
         Returns:
             One link per row, with carriers if the table has the carrier column of the study.
