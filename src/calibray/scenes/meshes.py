@@ -56,8 +56,8 @@ class Mesh:
         vertices: Positions [V, 3], [m].
         faces: Vertex indices of each triangle, counter-clockwise when seen from outside [F, 3].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
-        misread: Whether the tracer must read a PLY copy instead: the file stores integer coordinates, Mitsuba would
-            shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
+        misread: Whether the tracer must read a PLY copy instead, because the file stores integer coordinates, Mitsuba
+            would shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]
@@ -146,7 +146,7 @@ def _read_small_ply(content: bytes) -> Mesh:
 def _read_ply(content: bytes) -> Mesh:
     from trimesh.exchange.ply import load_ply
 
-    # trimesh accepts almost any line as a header line, and fails on comments that are not UTF-8.
+    # trimesh accepts almost any line as a header line, and expects comments in UTF-8.
     header = _HEADER.match(content)
     if header is None:
         raise InputError("is not a PLY file, or its header is damaged")

@@ -53,8 +53,8 @@ class SurfaceSize:
         area: Area [m^2].
         sides: Total length of the sides of all triangles [m].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
-        misread: Whether the tracer needs a copy: the file stores integer coordinates, the shape is a rectangle, or its
-            transform rotates about a vector that is not a unit vector.
+        misread: Whether the tracer needs a copy, because the file stores integer coordinates, the shape is a rectangle,
+            or its transform rotates about a vector that is not a unit vector.
     """
 
     low: tuple[float, float, float]
