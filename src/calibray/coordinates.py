@@ -34,7 +34,7 @@ class Frame:
         crs: The projection in any form that PROJ reads, such as `EPSG:32632`, a `+proj` string or WKT.
         easting: Easting of the origin in the projection [m].
         northing: Northing of the origin in the projection [m].
-        height: Height of z = 0 [m], above the same vertical datum as the other heights.
+        height: Height of z = 0 above the vertical datum of geographic heights [m].
 
     Raises:
         InputError: The projection is unknown to PROJ or not in metres with x pointing east and y pointing north, or the

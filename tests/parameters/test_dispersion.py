@@ -124,7 +124,7 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
         ),
         (
             lambda: parameters("walls.itu_a", "walls.thickness").matrix_indices(list(BASE)),
-            r"parameters walls\.itu_a, walls\.thickness: coefficients of laws have no cell in a matrix of constants",
+            r"parameters walls\.itu_a, walls\.thickness: coefficients of frequency laws have no entry",
         ),
         (
             lambda: parameters("walls.itu_a").check_carriers([4e9, 10e9]),

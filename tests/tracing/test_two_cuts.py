@@ -77,7 +77,12 @@ def test_three_layouts_give_the_same_antenna(layout, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", ["dBi", "(dBi)", "[dBI], peak", "in dBi"])
 def test_a_gain_is_in_dbi_if_its_line_contains_dbi(unit: str, tmp_path: Path) -> None:
-    for stated, gain in ((f"17.50 {unit}", 17.5), ("17.50 dBd (19.65 dBi)", 19.65), ("17.50", 19.65)):
+    for stated, gain in (
+        (f"17.50 {unit}", 17.5),
+        ("17.50 dBd (19.65 dBi)", 19.65),
+        ("17.50 (dBd) 19.65 dBi", 19.65),
+        ("17.50", 19.65),
+    ):
         (tmp_path / "sector.msi").write_text(classic().replace("GAIN 15.85", f"GAIN {stated}"))
         assert read_two_cuts(tmp_path / "sector.msi").gain_dbi == pytest.approx(gain)
 

@@ -179,7 +179,7 @@ def _chunk_power(chunk: Chunk, materials: dict[str, Material]) -> _Power:
 
 
 FEWEST_CLUSTERS: Final = 8
-"""Smallest number of clusters that contain links both inside and outside a group."""
+"""Smallest number of clusters with links both inside and outside a group for the group to be tested."""
 
 MIXED: Final = 0.5
 """Smallest share of the variance of membership that must lie within clusters for a group to be tested; with a smaller

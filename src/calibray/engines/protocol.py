@@ -73,13 +73,13 @@ class Differentiable(Engine, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Path loss and other observables of all links for n candidates.
+    """Path loss and further observables of all links for n candidates.
 
     Attributes:
         path_loss: Path loss [n, L], [dB]; +inf for a link without a path.
-        observed: K other observables [n, K, L], in SI units; NaN for a link without a value.
+        observed: K further observables [n, K, L], in SI units; NaN for a link without a value.
         loss_slope: Derivatives of path loss with respect to the parameters [n, L, d]; None if not requested.
-        observed_slope: Derivatives of the other observables [n, K, L, d]; None if not requested. They are NaN for a
+        observed_slope: Derivatives of the further observables [n, K, L, d]; None if not requested. They are NaN for a
             link without a value.
     """
 
@@ -116,7 +116,7 @@ def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> R
 
 @runtime_checkable
 class Observing(Engine, Protocol):
-    """An engine that computes other observables of the links."""
+    """An engine that computes further observables of the links."""
 
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
@@ -192,7 +192,7 @@ class Answer:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
         seconds: Duration of the call [s].
         failure: Error message that names the engine and the candidate; empty if the call succeeded.
-        rays: The unchanged response of a program that returns rays, or other observables [K, L] in SI units as
+        rays: The unchanged response of a program that returns rays, or further observables [K, L] in SI units as
             little-endian doubles; empty if there are neither rays nor observables.
         lost: Whether the call failed because its worker or guard ended, which is not the program's fault. The ledger
             does not store such a failure.
@@ -255,7 +255,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
 def gather_responses(
     answers: Iterable[Answer], shape: tuple[int, int], num_observables: int, first: bool
 ) -> Responses:
-    """Collect path loss and other observables of a batch of answers; observables are NaN for a failed candidate.
+    """Collect path loss and further observables of a batch of answers; observables are NaN for a failed candidate.
 
     Raises:
         EngineError: Every candidate of the first batch failed.

@@ -37,7 +37,7 @@ BATCH: Final = 32
 """Largest number of candidates in one call."""
 
 OBSERVED_SIZE: Final = 64
-"""Largest number of candidates in one call for other observables; the function is compiled for this number."""
+"""Largest number of candidates in one call for further observables; the function is compiled for this number."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Replay:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and other observables of every link; see `Observing.respond`."""
+        """Path loss and further observables of every link; see `Observing.respond`."""
         values, batches = check_candidates(candidates, len(self.parameters)), []
         channel = self._measuring(wanted)
         function = fields.link_responses_and_slopes if derivatives else fields.link_responses
@@ -168,7 +168,7 @@ class Replay:
 
     @cached_property
     def _channel(self) -> fields.Channel:
-        """The paths in the form required to compute other observables."""
+        """The paths in the form required to compute further observables."""
         plan = fields.layout(self.paths)
         return fields.Channel(
             plan.program,
@@ -393,7 +393,7 @@ class ReplayCarriers:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and other observables of every link; see `Observing.respond`."""
+        """Path loss and further observables of every link; see `Observing.respond`."""
         candidates = check_candidates(candidates, len(self.parameters))
         parts = []
         for replay, frequency, _ in self._carriers:

@@ -46,9 +46,9 @@ def coefficients(
 ) -> tuple[Pair, Pair]:
     """Transverse electric and magnetic reflection coefficients; transmission coefficients where `transmitted` is true.
 
-    The permittivity is relative, `loss` is from `loss_term`, and the thickness is in [m]. Each coefficient is
-    (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double precision, because the
-    fourth power of a metal's permittivity exceeds the range of single precision.
+    The permittivity is relative, `loss` comes from `loss_term`, and thickness and wavelength are in metres. Each
+    coefficient is (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double
+    precision, because the fourth power of a metal's permittivity exceeds the range of single precision.
     """
     precision = cosine.dtype
     cosine, permittivity, loss, thickness, wavelength = (

@@ -210,8 +210,8 @@ def place_rows(
     """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
     A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude, latitude
-    [deg] and height [m]. The rows and the names of the columns are returned. If a filter is the only step, the
-    arguments are returned unchanged.
+    [deg] and height [m]. The result is the table with these columns, and their names for both ends. If a filter is the
+    only step, the arguments are returned unchanged.
 
     Raises:
         InputError: A column is missing or not numeric, or a geographic position is invalid.

@@ -385,7 +385,7 @@ resolution of a millimetre at best, and coordinate conversions differ by microme
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of each link into the first row, with the means of linear power, weights and other observables.
+    """Merge the rows of each link into the first row, with the means of linear power, weights and further observables.
 
     Rows belong to one link if their positions agree within `SAME_POSITION`, and the transmitter, kept columns, carrier
     frequency, transmitted power and times are equal. Rows at different times remain separate links. Rows below the

@@ -356,7 +356,7 @@ NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""A residual does not affect the scales if its standard deviation is below this share of the largest one."""
+"""A residual does not affect the scales if its standard deviation is below this share of the largest deviation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -265,15 +265,15 @@ class Parameters:
         """Row and column of each material parameter in a matrix of constants [materials, fields].
 
         Replay uses these indices to insert candidates: ``constants.at[..., rows, columns].set(candidates)``.
-        Coefficients of laws have no cell; use the parameters of `at_carrier` instead.
+        Coefficients of frequency laws have no entry; use the parameters of `at_carrier` instead.
 
         Raises:
             InputError: The material of a parameter is not in `materials`, or a parameter is a coefficient of a law.
         """
         if self.has_laws:
             raise InputError(
-                f"parameters {', '.join(self.names)}: coefficients of laws have no cell in a matrix of constants; call "
-                "at_carrier first"
+                f"parameters {', '.join(self.names)}: coefficients of frequency laws have no entry in a matrix of "
+                "constants; call at_carrier first"
             )
         row_of = {name: row for row, name in enumerate(materials)}
         items = [parameter for parameter in self.items if not parameter.is_effect]

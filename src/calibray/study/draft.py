@@ -240,9 +240,12 @@ def _add_flight_times(draft: LinksDraft) -> None:
     draft.assume(
         "observables.flight",
         column,
-        f"by its name; the bias of {'each' if bias != 'all' else 'the'} device is unknown",
+        f"by its name; the bias of {'each transmitter' if bias != 'all' else 'the device'} is unknown",
     )
 
+
+MOST_MATERIALS: Final = 6
+"""Largest number of materials that a draft calibrates; links seldom identify more."""
 
 INDOOR_DEPTHS: Final = (3, 5)
 """Smallest and largest number of interactions of an indoor study."""
@@ -388,8 +391,7 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
     """The entries of ``[parameters]``: permittivities and, indoors, conductivities, which determine wall losses."""
     bounds_of = permittivity_bounds(scene.materials)
-    # Links can seldom identify more than six materials.
-    names = list(bounds_of)[:6]
+    names, rest = list(bounds_of)[:MOST_MATERIALS], list(bounds_of)[MOST_MATERIALS:]
     if not names:
         raise InputError(f"{links.scene}: no material to calibrate; all materials are metal or air")
     entries: dict[str, dict[str, Any]] = {}
@@ -399,8 +401,12 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
         if indoors and conductivity > 0:
             bounds = [min(1e-3, float(f"{conductivity / 10:.0e}")), 3.0]
             entries[f"{name}.conductivity"] = {"bounds": bounds, "scale": "log"}
-    reason = "the scene's materials except metal and air; start values are those of the scene"
-    links.assume("parameters", ", ".join(names), reason)
+    chosen = "the scene's materials except metal and air"
+    if rest:
+        chosen = (
+            f"the first {MOST_MATERIALS} materials except metal and air; not calibrated: {', '.join(rest)}"
+        )
+    links.assume("parameters", ", ".join(names), f"{chosen}; start values are those of the scene")
     return entries
 
 

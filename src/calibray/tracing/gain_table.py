@@ -112,11 +112,11 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
 
 def _gain_dbi(place: str, words: list[str]) -> float:
     text = " ".join(words)
-    joined = re.fullmatch(rf"({_NUMBER.pattern})\s*(dbi|dbd)?(?:\s.*)?", text, re.IGNORECASE)
+    joined = re.fullmatch(rf"({_NUMBER.pattern})\s*[(\[]?(dbi|dbd)?[)\]]?(?:\s.*)?", text, re.IGNORECASE)
     if joined is None:
         raise InputError(f"{place}: GAIN {shortened(text)!r}: must be a number, such as 'GAIN 17.5 dBi'")
     value = float(joined.group(1).replace(",", "."))
-    # A unit directly after the number takes precedence over one in a comment.
+    # A unit next to the number, also in brackets, takes precedence over one in a comment.
     unit = (joined.groups()[-1] or ("dbi" if "dbi" in text.lower() else "dbd")).lower()
     return _cut_in_range(place, "GAIN", value if unit == "dbi" else value + DIPOLE_GAIN_DBI)
 

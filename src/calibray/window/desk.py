@@ -126,7 +126,7 @@ class StudyFolder:
             raise InputError(f"{shown}: the name is too long; shorten it to {_LONGEST_NAME} bytes")
         if not _NAME.fullmatch(letters) or name.endswith((" ", ".")):
             raise InputError(
-                f"{shown}: use letters, digits, spaces, and . _ - ( ) + in file names; rename the file"
+                f"{shown}: use only letters, digits, spaces and . _ - ( ) + in file names; rename the file"
             )
         ending = Path(name).suffix.lower()
         if ending not in (*MAPS, *TABLES, *PARTS, *TWO_CUT_SUFFIXES, *MESHES):

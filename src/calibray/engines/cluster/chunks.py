@@ -351,7 +351,7 @@ class ChunkedReplay:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and other observables of every link, collected in this process; see `Observing.respond`."""
+        """Path loss and further observables of every link, collected in this process; see `Observing.respond`."""
         values = check_candidates(candidates, len(self.parameters))
         answers = self._answers("respond", values, wanted, derivatives)
         return of_links([part for _, part in answers], list(self.chunks))

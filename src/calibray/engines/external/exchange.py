@@ -141,7 +141,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
 def read_answer(
     path: Path, file_format: str, num_links: int, num_observables: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read a program's response: path loss [L], [dB], and other observables [K, L], in their units.
+    """Read a program's response: path loss [L], [dB], and further observables [K, L], in their units.
 
     Path loss is +inf for a link without a path; an observable is NaN for a link without a value.
 
@@ -195,7 +195,7 @@ def read_rays(path: Path, num_links: int) -> bytes:
         table = parse_rays(response, RESPONSE)
         if ANSWER in table.frame and RAY_COLUMNS[0] not in table.frame:
             raise Unusable(
-                f"{RESPONSE} contains {ANSWER}, which is path loss instead of a ray table; remove rays = true from "
+                f"{RESPONSE} contains path loss ({ANSWER}) instead of a ray table; remove rays = true from "
                 "[engine], or return a ray table"
             )
         RayTable.of(table)

@@ -42,7 +42,7 @@ GUARD: Final = (
 
 
 Response = tuple[NDArray[np.float64], NDArray[np.float64]] | bytes
-"""Either path loss [L], [dB], and other observables [K, L] in SI units, or a ray table."""
+"""Either path loss [L], [dB], and further observables [K, L] in SI units, or a ray table."""
 
 
 class Unstartable(Unusable):
@@ -65,7 +65,7 @@ class Outcome:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if the attempts failed.
         seconds: Total duration of all attempts [s].
         failure: Error of the last attempt; empty if it succeeded.
-        rays: The response of a program that returns rays; otherwise other observables [K, L] in SI units as
+        rays: The response of a program that returns rays; otherwise further observables [K, L] in SI units as
             little-endian doubles, or empty.
         lost: Whether the last attempt failed because a worker or the guard ended, which is not the program's fault.
     """

@@ -130,7 +130,7 @@ class Command:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and other observables of every link, from the program's answers; see `Observing.respond`.
+        """Path loss and further observables of every link, from the program's answers; see `Observing.respond`.
 
         Raises:
             InputError: The program does not compute these observables, or derivatives are requested.

@@ -138,7 +138,7 @@ class LedgerEntry:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path.
         seconds: Duration of the call [s].
         failure: Error message; empty if the call succeeded.
-        rays: Rays or other observables, as in `engines.protocol.Answer`; empty if there are none.
+        rays: Rays or further observables, as in `engines.protocol.Answer`; empty if there are none.
     """
 
     path_loss_db: NDArray[np.float64]

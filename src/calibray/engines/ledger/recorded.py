@@ -88,7 +88,7 @@ class Recorded:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and the requested other observables; see `Observing.respond`.
+        """Path loss and the requested further observables; see `Observing.respond`.
 
         Raises:
             InputError: Derivatives are requested.

@@ -194,7 +194,7 @@ class Edge:
         normal_0: Outward normal of the 0-face [3].
         normal_n: Outward normal of the other face [3].
         direction: Unit vector e along the edge [3]; the cross product normal_0 x e points into the 0-face.
-        error: Distance by which the path violates Keller's law [m].
+        error: Deviation of the path from Keller's law, as a displacement [m].
     """
 
     face: int

@@ -40,7 +40,7 @@ from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, l
 CONVERGED_DB: Final = 0.05
 """Largest change of a link's path loss in a round at which the link counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
-"""Number of consecutive rounds without a larger change after which the search ends."""
+"""The search ends after this many consecutive rounds without a change above `CONVERGED_DB`."""
 MAX_LAUNCHES: Final = 256
 """Largest number of launches per source: 64 million rays."""
 GEOMETRY_BATCH: Final = 500_000
