@@ -24,7 +24,6 @@ from window_server import (
     CHROMIUM,
     SIZES,
     add,
-    choose,
     command,
     finished,
     launched,
@@ -214,24 +213,18 @@ def test_what_an_editor_changed_in_the_study_is_shown_and_not_undone(walked):
     page.context.close()
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [("plan", "must be a number of metres"), ("osm", "must be empty: the map contains the heights")],
-)
-def test_a_height_that_a_scene_would_not_use_is_refused(walked, kind, message):
+def test_a_column_of_heights_is_refused_for_a_plan(walked):
     _, _, browser, address = walked
     page = opened(browser, address)
     page.locator("#plan[data-links='84']").wait_for()
     before = command(page)
-    choose(page, "Map or plan", "Kind", kind)
     step(page, "Map or plan").get_by_text("Settings of the scene").click()
     height = step(page, "Map or plan").get_by_label("Height: a column, or metres")
     height.fill("storeys")
     step(page, "Map or plan").get_by_role("button", name="Make the scene").click()
-    page.get_by_text(f"Height storeys: {message}").wait_for()
+    page.get_by_text("Height storeys: must be a number of metres").wait_for()
     assert command(page) == before
     height.fill("")
-    choose(page, "Map or plan", "Kind", "plan")
     page.wait_for_timeout(300)
     page.context.close()
 

@@ -14,7 +14,7 @@ from calibray.errors import InputError
 from calibray.study import Study
 from calibray.window.desk import Desk, StudyFolder, plan, sites, solid
 from calibray.window.result_steps import write_links
-from calibray.window.study_steps import _entry, likely_tables
+from calibray.window.study_steps import _entry, likely_tables, show_scene
 from small_scenes import block, write_scene
 
 STUDY = """version = 1
@@ -197,6 +197,38 @@ def test_what_a_parameter_states_is_kept():
             assert _entry(name, entry)() == entry
     for slider in (part for part in client.elements.values() if isinstance(part, ui.slider)):
         assert slider.props["min"] <= slider.value <= slider.props["max"]
+
+
+OF_MAPS = {
+    "Walls (ITU-R P.2040)",
+    "Thickness of walls [m]",
+    "Ground",
+    "Height model of the ground",
+    "One mesh per building",
+}
+
+
+@pytest.mark.parametrize(
+    ("chosen", "settings"),
+    [
+        ("osm", OF_MAPS),
+        ("footprints", {"Height: a column, or metres", *OF_MAPS}),
+        ("plan", {"Height: a column, or metres", "Unit of a plan [m]", "Materials of a plan"}),
+    ],
+)
+def test_only_the_settings_of_the_chosen_kind_of_map_are_shown(tmp_path, chosen, settings):
+    (tmp_path / "houses.geojson").write_text("{}")
+    with Client(page("/")) as client:
+        show_scene(Desk(StudyFolder(tmp_path)))
+    fields = {
+        part.props.get("label") or part.text: part
+        for part in client.elements.values()
+        if hasattr(part, "value")
+    }
+    fields.pop("Kind").value = chosen
+    assert {name for name, field in fields.items() if field.visible} >= settings
+    hidden = {"Height: a column, or metres", "Unit of a plan [m]", "Materials of a plan", *OF_MAPS} - settings
+    assert not any(fields[name].visible for name in hidden)
 
 
 @pytest.mark.parametrize("centre", [{"value": 5.0}, {"like": "walls.relative_permittivity"}])

@@ -78,24 +78,20 @@ def show_scene(desk: Desk) -> None:
             )
             relief = desk.keep(ui.select(["", *terrain], label="Height model of the ground", value=""))
             apart = desk.keep(ui.switch("One mesh per building"))
+            # Only the settings that the chosen command has are shown.
+            height.bind_visibility_from(kind, "value", lambda value: value != "osm")
+            for setting in (wall, thickness, ground, relief, apart):
+                setting.bind_visibility_from(kind, "value", lambda value: value != "plan")
+            for setting in (unit, materials):
+                setting.bind_visibility_from(kind, "value", value="plan")
 
         def make() -> None:
             with desk.messages():
                 words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
-                if (
-                    height.value
-                    and kind.value != "footprints"
-                    and not (kind.value == "plan" and _is_number(height.value))
-                ):
-                    means = (
-                        "a number of metres"
-                        if kind.value == "plan"
-                        else "empty: the map contains the heights"
-                    )
-                    raise InputError(f"Height {height.value}: must be {means}")
                 if kind.value == "plan":
+                    if height.value and not _is_number(height.value):
+                        raise InputError(f"Height {height.value}: must be a number of metres")
                     words += ["--unit", unit.value] if unit.value else []
-                    words += [f"--height={height.value}"] if _is_number(height.value) else []
                     stated = filter(None, map(str.strip, (materials.value or "").split(",")))
                     words += [f"--material={material}" for material in stated]
                 else:
@@ -107,7 +103,7 @@ def show_scene(desk: Desk) -> None:
                     ]
                     words += ["--terrain", relief.value] if relief.value else []
                     words += ["--per-building"] if apart.value else []
-                if kind.value == "footprints":
+                if kind.value != "osm":
                     words += [f"--height={height.value}"] if height.value else []
                 desk.scene = "scene/scene.xml"
                 desk.start(words)
