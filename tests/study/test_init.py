@@ -666,6 +666,18 @@ def test_round_trip_times_become_an_observable_with_a_bias_per_access_point(scen
     assert section.scale == pytest.approx(1 / 299_792_458)
 
 
+def test_flight_times_of_several_devices_have_a_bias_per_device(scene, tmp_path):
+    columns = {
+        "ap": ["a", "a", "b", "b"], "ap_x": [0.0, 0, 5, 5], "ap_y": 0.0, "ap_z": 2.5, "rx_x": [3.0, 4, 5, 6],
+        "rx_y": -12.0, "rx_z": 1.5, "path_loss_db": [50.0, 52, 54, 60], "tof_ns": [40.0, 50, 60, 70],
+        "geraet": ["Gerät A", "Gerät B"] * 2,
+    }  # fmt: skip
+    found = draft(scene, table(tmp_path, **columns), tmp_path / "study.toml", frequency=2.4e9)
+    assert found.study.observables["flight"].bias == "geraet"
+    reasons = {each.what: each.reason for each in found.assumptions}
+    assert reasons["observables.flight"] == "by its name; the bias of each device is unknown"
+
+
 def test_transmitters_in_the_links_get_an_offset_each(scene, tmp_path):
     columns = {
         "x": np.arange(10.0),

@@ -232,16 +232,18 @@ def _add_flight_times(draft: LinksDraft) -> None:
     if flight_time is None or "wide" in draft.section:
         return
     column, kind, unit = flight_time
+    # The clock of a device adds the same error to all times that it measures.
+    devices = transmitter_columns.find_devices(draft.table.frame)
     transmitter = draft.section.get("transmitter")
-    bias = transmitter if transmitter in draft.table.frame else "all"
+    bias, whose = "all", "the device"
+    if devices:
+        bias, whose = devices[0], "each device"
+    elif transmitter in draft.table.frame:
+        bias, whose = transmitter, "each transmitter"
     draft.observables["flight"] = {
         "kind": kind, "column": column, "unit": unit, "bias": bias, "path": "first"
     }  # fmt: skip
-    draft.assume(
-        "observables.flight",
-        column,
-        f"by its name; the bias of {'each transmitter' if bias != 'all' else 'the device'} is unknown",
-    )
+    draft.assume("observables.flight", column, f"by its name; the bias of {whose} is unknown")
 
 
 MOST_MATERIALS: Final = 6
