@@ -678,6 +678,17 @@ def test_flight_times_of_several_devices_have_a_bias_per_device(scene, tmp_path)
     assert reasons["observables.flight"] == "by its name; the bias of each device is unknown"
 
 
+@pytest.mark.parametrize("name", ["ds_ns", "Delay Spread [ns]", "RMS-DelaySpread (ns)"])
+def test_a_delay_spread_is_named_with_the_section_that_would_use_it(scene, tmp_path, name):
+    columns = {"tx_x": 0.0, "tx_y": 0.0, "tx_z": 2.5, "rx_x": [3.0, 4, 5, 6], "rx_y": -12.0, "rx_z": 1.5}
+    file = table(tmp_path, **columns, path_loss_db=[50.0, 52, 54, 60], **{name: [10.0, 12, 14, 9]})
+    found = draft(scene, file, tmp_path / "study.toml", frequency=2.4e9)
+    assert not found.study.observables
+    reason = {each.what: each.reason for each in found.assumptions}["observables.spread"]
+    assert reason.startswith(f"column {name} is not used")
+    assert f'[observables.spread] with kind = "rms_delay_spread", column = "{name}", unit = "ns"' in reason
+
+
 def test_transmitters_in_the_links_get_an_offset_each(scene, tmp_path):
     columns = {
         "x": np.arange(10.0),

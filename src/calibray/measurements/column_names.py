@@ -50,6 +50,7 @@ PATTERNS: Final = {
     r"rauschen|ruido|bruit|rumore|qualit(a|ae)t|calidad|qualite|qualita|nachbar(zelle)?|vecin[ao]|voisine?",
     "round-trip time": r"rtt|ftm|rtd",
     "time of flight": r"tof|toa",
+    "delay spread": r"ds|laufzeitspreizung",
     "accuracy": r"std|sigma|var|variance|error|accuracy|count|n|num|number|status|success.*|attempt.*|quality",
     "EIRP": r"eirp",
     "transmitted": r"tx|transmit|transmitted|sende(r|leistung)|transmitida|emise",
@@ -147,6 +148,7 @@ def words(name: object) -> frozenset[str]:
     # A time of flight must not be mistaken for a time of day.
     text = re.sub(r"(?i)time[ _-]*of[ _-]*flight", "tof", without_accents(name).replace("\u03bc", "u"))
     text = re.sub(r"(?i)round[ _-]*trip[ _-]*time", "rtt", text)
+    text = re.sub(r"(?i)delay[ _-]*spread", "ds", text)
     # The h in a unit of speed or time does not indicate a column of heights.
     text = re.sub(r"(?i)(?<![a-z])k?m\s*/\s*[hs](?![a-z])|[\[(]\s*h\s*[\])]", " ", text)
     # Units with several capitals, such as "dBm", stay one word.
@@ -180,12 +182,31 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
     for name in numeric_columns(frame):
         if matches(name, "accuracy") or not matches(name, "round-trip time", "time of flight"):
             continue
-        unit = next((unit for unit in ("ps", "ns", "us", "ms", "s", "m") if unit in words(name)), None)
+        unit = _unit_of_delay(name, "m")
         if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
             # Devices that give a round trip in metres state the one-way distance.
             returned = matches(name, "round-trip time") and unit != "m"
             return name, "round_trip_time" if returned else "time_of_flight", unit
     return None
+
+
+def find_delay_spread(frame: pd.DataFrame) -> tuple[str, str] | None:
+    """Find the column of delay spreads, with its unit; None without such a column.
+
+    Example:
+        >>> find_delay_spread(pd.DataFrame({"ds_std_ns": [2.0], "RMS Delay Spread [ns]": [80.0]}))
+        ('RMS Delay Spread [ns]', 'ns')
+    """
+    for name in numeric_columns(frame):
+        unit = _unit_of_delay(name)
+        if unit is not None and matches(name, "delay spread") and not matches(name, "accuracy"):
+            return name, unit
+    return None
+
+
+def _unit_of_delay(name: str, *others: str) -> str | None:
+    """The unit of time, or one of the other units, that the name of a column states; None without one."""
+    return next((unit for unit in ("ps", "ns", "us", "ms", "s", *others) if unit in words(name)), None)
 
 
 def numeric_columns(frame: pd.DataFrame) -> list[str]:

@@ -77,7 +77,7 @@ def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDra
     _add_noise_floor(draft, value)
     _add_averaging(draft, draft.rx)
     draft.add_heights()
-    _add_flight_times(draft)
+    _add_observables(draft)
     return draft
 
 
@@ -226,10 +226,19 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
     draft.assume("links.average", f"cells of {size:g} m", f"{rows}; {reason}")
 
 
-def _add_flight_times(draft: LinksDraft) -> None:
-    flight_time = column_names.find_flight_time(draft.table.frame)
-    # A row of a wide table has the powers of several transmitters, but only one flight time.
-    if flight_time is None or "wide" in draft.section:
+def _add_observables(draft: LinksDraft) -> None:
+    # A row of a wide table has the powers of several transmitters, but only one flight time or delay spread.
+    if "wide" in draft.section:
+        return
+    if (delay_spread := column_names.find_delay_spread(draft.table.frame)) is not None:
+        name, unit = (json.dumps(part, ensure_ascii=False) for part in delay_spread)
+        reason = (
+            f"column {delay_spread[0]} is not used, because its value depends on the receiver; to fit it, add "
+            f'[observables.spread] with kind = "rms_delay_spread", column = {name}, unit = {unit}, and the '
+            "receiver's dynamic_range_db or bandwidth"
+        )
+        draft.assume("observables.spread", "none", reason)
+    if (flight_time := column_names.find_flight_time(draft.table.frame)) is None:
         return
     column, kind, unit = flight_time
     # The clock of a device adds the same error to all times that it measures.
