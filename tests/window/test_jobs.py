@@ -11,9 +11,13 @@ import time
 
 import psutil
 import pytest
+from nicegui import Client, ui
+from nicegui.page import page
 
 from calibray.errors import InputError
-from calibray.window.jobs import FOLDER, Jobs, main
+from calibray.window.desk import Desk, StudyFolder
+from calibray.window.jobs import FOLDER, Job, Jobs, main
+from calibray.window.result_steps import _row
 
 
 def test_a_command_ends_with_its_status_and_output(tmp_path):
@@ -101,3 +105,18 @@ def test_a_command_that_ends_at_once_is_recorded(tmp_path, monkeypatch):
     jobs = Jobs(tmp_path)
     jobs.start(["--version"])
     assert [(job.state, job.words) for job in jobs.list()] == [("died", ("--version",))]
+
+
+def test_only_a_command_that_keeps_finished_work_can_be_resumed(tmp_path):
+    names = []
+    for words in (("init", "scene.xml", "links.csv"), ("run", "study.toml")):
+        with Client(page("/")) as client:
+            _row(Desk(StudyFolder(tmp_path)), Job(1, words, "failed", 1))
+        names.append(
+            [
+                (part.text, part.props["aria-label"])
+                for part in client.elements.values()
+                if isinstance(part, ui.button)
+            ]
+        )
+    assert names == [[], [("Resume", "Resume: start this command again without repeating finished work")]]

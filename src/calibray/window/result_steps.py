@@ -64,6 +64,10 @@ def show_run(desk: Desk) -> None:
     show_commands(desk)
 
 
+RESUMED: Final = frozenset({"run", "validate", "trace", "predict", "map", "suggest"})
+"""Commands that keep finished work: traces in the cache, or calls of an engine in the ledger."""
+
+
 @ui.refreshable
 def show_commands(desk: Desk) -> None:
     """Draw the list of commands that have run or are running in the folder."""
@@ -80,9 +84,10 @@ def show_commands(desk: Desk) -> None:
 def _row(desk: Desk, job: Job) -> None:
     ui.label(job.state if job.number else f"{job.state}, in a terminal").classes(f"state {job.state}")
     ui.label(job.command).classes("command")
-    if job.state in {"died", "stopped", "failed"}:
+    if job.state in {"died", "stopped", "failed"} and RESUMED.intersection(job.words[:1]):
+        # The name starts with the text of the button, so that voice control finds it (WCAG 2.5.3).
         ui.button("Resume", on_click=lambda: desk.start(job.words)).props(
-            'outline dense aria-label="Start this command again; finished work is not repeated"'
+            'outline dense aria-label="Resume: start this command again without repeating finished work"'
         )
     if job.log:
         with ui.expansion("Output").classes("wide"):
