@@ -14,7 +14,7 @@ from calibray.errors import InputError
 from calibray.study import Study
 from calibray.window.desk import Desk, StudyFolder, plan, sites, solid
 from calibray.window.result_steps import write_links
-from calibray.window.study_steps import _entry, likely_tables, show_scene
+from calibray.window.study_steps import _entry, likely_tables, show_parameters, show_scene
 from small_scenes import block, write_scene
 
 STUDY = """version = 1
@@ -102,6 +102,20 @@ def test_of_a_file_that_is_not_a_study_the_page_shows_no_values(folder, wrong):
     assert folder.valid_content() == folder.content()
     folder.study_file.write_text(STUDY.replace("bounds = [1.5, 12.0]", wrong))
     assert folder.valid_content() == {}
+
+
+def test_a_study_with_an_error_need_not_be_drafted_again(folder):
+    for text, shown in (
+        (STUDY.replace("version = 1", "version = = 1"), "study.toml has an error, shown under Measurements."),
+        (STUDY + "[trcae]", "study.toml has an error, shown under Measurements."),
+        (None, "Draft the study first."),
+    ):
+        folder.study_file.unlink(missing_ok=True) if text is None else folder.study_file.write_text(text)
+        with Client(page("/")) as client:
+            show_parameters(Desk(folder))
+        texts = [part.text for part in client.elements.values() if isinstance(part, ui.label)]
+        assert len(texts) == 1
+        assert texts[0].startswith(shown)
 
 
 def test_the_latest_result_is_the_last(folder, tmp_path):

@@ -314,7 +314,10 @@ def show_parameters(desk: Desk) -> None:
     """Draw the step for parameters: the choice of calibrated parameters, and their bounds and priors."""
     parameters = desk.folder.valid_content().get("parameters")
     if not isinstance(parameters, dict):
-        ui.label("Draft the study first.").classes("quiet")
+        missing = "Draft the study first."
+        if desk.folder.study_file.is_file():
+            missing = f"{STUDY} has an error, shown under Measurements. Correct it in a text editor."
+        ui.label(missing).classes("quiet")
         return
     edits = {name: _entry(name, entry) for name, entry in parameters.items()}
 
