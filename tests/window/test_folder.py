@@ -14,7 +14,7 @@ from calibray.errors import InputError
 from calibray.study import Study
 from calibray.window.desk import Desk, StudyFolder, plan, sites, solid
 from calibray.window.result_steps import write_links
-from calibray.window.study_steps import _entry, likely_tables, show_parameters, show_scene
+from calibray.window.study_steps import _entry, likely_tables, show_measurements, show_parameters, show_scene
 from small_scenes import block, write_scene
 
 STUDY = """version = 1
@@ -116,6 +116,24 @@ def test_a_study_with_an_error_need_not_be_drafted_again(folder):
         texts = [part.text for part in client.elements.values() if isinstance(part, ui.label)]
         assert len(texts) == 1
         assert texts[0].startswith(shown)
+
+
+def test_a_carrier_that_is_no_number_is_named_and_starts_nothing(tmp_path, monkeypatch):
+    (tmp_path / "links.csv").write_text("rx_x,rx_y,loss\n1,2,90\n")
+    shown, started = [], []
+    monkeypatch.setattr(ui, "notify", lambda text, **_: shown.append(text))
+    monkeypatch.setattr(Desk, "start", lambda _, words: started.append(words[-1]))
+    with Client(page("/")) as client:
+        show_measurements(Desk(StudyFolder(tmp_path), scene="scene.xml"))
+        parts = list(client.elements.values())
+        field = next(part for part in parts if part.props.get("label") == "Carrier frequency [Hz]")
+        button = next(part for part in parts if isinstance(part, ui.button))
+        (press,) = button._event_listeners.values()
+        for value in ("2,44 GHz", "2.44e9"):
+            field.value = value
+            press.handler(None)
+    assert shown == ["Carrier frequency [Hz]: 2,44 GHz, must be a number such as 2.44e9"]
+    assert started == ["--frequency=2.44e9"]
 
 
 def test_the_latest_result_is_the_last(folder, tmp_path):

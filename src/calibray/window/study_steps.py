@@ -172,6 +172,10 @@ def show_measurements(desk: Desk) -> None:
         if desk.scene is None:
             ui.notify("Make or add a scene first.", type="negative")
             return
+        if frequency.value and not _is_number(frequency.value):
+            wrong = f"Carrier frequency [Hz]: {frequency.value}, must be a number such as 2.44e9"
+            ui.notify(wrong, type="negative")
+            return
         words: list[object] = ["init", desk.scene, links.value, "--out", STUDY]
         options = {
             "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
