@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -258,6 +259,14 @@ def test_types_become_materials(tmp_path):
     }  # fmt: skip
     with pytest.raises(InputError, match=r"no material for 'brik'; .*--material brik=concrete; .*'brick'"):
         make_plan_scene([line(0, 0, 1, 0, "brik")], tmp_path)
+
+
+@pytest.mark.parametrize(("kind", "fault"), [("wood door", "no material"), ("brick", "encloses no area")])
+def test_messages_about_a_plan_name_its_file(tmp_path, kind, fault):
+    file = tmp_path / "Grundriß EG.csv"
+    file.write_text(f"x0,y0,x1,y1,type\n0,0,4,0,{kind}\n")
+    with pytest.raises(InputError, match=re.escape(f"floor plan {file}: {fault}")):
+        make_plan_scene(read_plan(file), tmp_path / "scene")
 
 
 def test_a_plan_of_unusual_size_asks_for_its_unit(tmp_path, caplog):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -68,6 +68,7 @@ class Segment:
         bottom: Height of the bottom [m].
         top: Height of the top [m].
         thickness: Thickness [m]; None if unknown.
+        source: The plan, as messages name it.
     """
 
     start: tuple[float, float]
@@ -76,6 +77,7 @@ class Segment:
     bottom: float
     top: float
     thickness: float | None = None
+    source: str = field(default="floor plan", compare=False)
 
     @property
     def length(self) -> float:
@@ -118,12 +120,13 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         unit = (stated_unit(path) if exists(path) else None) or 1.0
         if unit != 1:
             _LOG.warning("floor plan %s: its header states a unit of %g m; --unit overrides it", path, unit)
+    source = f"floor plan {path}"
     frame, lines = (_read_vector if is_vector else _read_table)(path, unit)
     numbers = {name: _numbers(path, frame, name) * unit for name in ("thickness", "bottom", "height")}
     segments = []
     for index, (kind, parts) in enumerate(zip(frame["type"], lines, strict=True)):
         thickness, bottom, extent = (float(values[index]) for values in numbers.values())
-        row = f"floor plan {path}, {frame.index[index]}"
+        row = f"{source}, {frame.index[index]}"
         points = np.concatenate(parts) * unit if parts else np.empty((0, 2))
         if pd.isna(kind) or not len(points) or not np.isfinite(points).all():
             raise InputError(f"{row}: has no type or lacks a coordinate; complete or remove it")
@@ -149,7 +152,8 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
             )
         stated = None if np.isnan(thickness) else thickness
         segments += [
-            Segment(a, b, str(kind).strip().lower(), bottom, bottom + extent, stated) for a, b in sides
+            Segment(a, b, str(kind).strip().lower(), bottom, bottom + extent, stated, source)
+            for a, b in sides
         ]
     if not segments:
         raise InputError(f"floor plan {path}: contains no segment; give at least one wall")

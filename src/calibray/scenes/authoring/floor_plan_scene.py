@@ -99,20 +99,20 @@ def make_plan_scene(
     if not segments:
         raise InputError("the floor plan contains no segment; give at least one wall")
     merged = merge_faces(segments) if merge else MergedPlan(segments)
-    sheets = merged.sheets
+    sheets, source = merged.sheets, segments[0].source
     if lids and (level := _separation(sheets)) is not None:
         raise InputError(
-            f"floor plan: a storey begins at {level:g} m, where the scene would have no floor; make a separate scene "
+            f"{source}: a storey begins at {level:g} m, where the scene would have no floor; make a separate scene "
             "of each storey, or omit floor and ceiling (--no-floor --no-ceiling) and add the floors to the scene "
             "yourself"
         )
-    materials = _materials(sheets, types)
+    materials = _materials(sheets, types, source)
     pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
     objects = _wall_objects(pieces)
     outline = _enclosed(pieces)
     if lids and outline.area == 0:
         raise InputError(
-            "the floor plan encloses no area for a floor or ceiling; draw walls around the room, or omit both "
+            f"{source}: encloses no area for a floor or ceiling; draw walls around the room, or omit both "
             "(--no-floor --no-ceiling)"
         )
     heights = {"floor": min(sheet.bottom for sheet in sheets), "ceiling": max(sheet.top for sheet in sheets)}
@@ -130,14 +130,16 @@ def make_plan_scene(
     return scene
 
 
-def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:
+def _materials(
+    sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial], source: str
+) -> list[SurfaceMaterial]:
     """The material of each sheet; a type with several thicknesses has several materials."""
     unknown = dict.fromkeys(sheet.kind for sheet in sheets if sheet.kind not in {*types, *ITU_NAMES})
     if unknown:
         listed = list(unknown)[:10]
         options = " ".join(f"--material {shlex.quote(kind)}=concrete" for kind in listed)
         raise InputError(
-            f"floor plan: no material for {', '.join(map(repr, listed))}; assign the closest ITU-R P.2040 material to "
+            f"{source}: no material for {', '.join(map(repr, listed))}; assign the closest ITU-R P.2040 material to "
             f"each, as in {options}; or correct the type, {did_you_mean(listed[0], sorted({*types, *ITU_NAMES}))}"
         )
     materials = []
