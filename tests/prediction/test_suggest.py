@@ -100,6 +100,15 @@ def test_the_first_suggestion_has_the_largest_slope(result, table):
     assert slope[table.rx_x == suggestions.rx_x[0]] > 0.9 * np.sort(slope)[-3]
 
 
+def test_every_stage_of_a_suggestion_is_announced(result, table):
+    stages = []
+    cb.suggest(result, table, 1, lambda stage, *_: stages.append(stage))
+    announced = [stage for stage in dict.fromkeys(stages) if stage != "tracing"]
+    assert announced == [
+        "reading scene and links", "evaluating draws", "evaluating candidates", "choosing candidates"
+    ]  # fmt: skip
+
+
 def test_a_promised_width_keeps_how_much_other_buildings_differ(result, table):
     """The draws are of the measured buildings; what the interval of all buildings has besides is not narrowed."""
     plain = cb.suggest(result, table, 3)[f"{NAME}_width"].to_numpy()

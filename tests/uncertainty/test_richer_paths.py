@@ -79,6 +79,10 @@ def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, R
     # No stage seems to run twice.
     assert stages.count("drawing") == 1
     assert "fitting more paths" in stages
+    # Work that takes long without a known amount is announced as well.
+    announced = ["evaluating initial values", "finding minima", "drawing", "judging intervals"]
+    assert [stage for stage in stages if stage in announced] == announced
+    assert stages[-1] == "examining residuals"
     cost = result.cost
     assert cost.total_seconds >= cost.trace_seconds + cost.seconds + cost.uncertainty_seconds
     if refracted:

@@ -34,7 +34,7 @@ from calibray.study import Setup, Study
 from calibray.study.link_checks import suspicions
 from calibray.support.interruption import ensure_interruption, unwrap_interruption
 from calibray.support.output_files import check_outputs
-from calibray.support.progress import Progress
+from calibray.support.progress import Progress, start_stage
 from calibray.tracing import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
@@ -124,6 +124,7 @@ def calibrate(
     exporting = None
     if maps_rays(setup) and isinstance(engine, Answering):
         engine = exporting = Exporting(engine, setup)
+    start_stage(progress, "evaluating initial values")
     problem = Problem.of(setup, engine)
     if problem.objective.num_counted < 2:
         raise InputError(
@@ -158,6 +159,7 @@ def calibrate(
         many = len(trail.minima) > 2
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
+    start_stage(progress, "examining residuals")
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
     # A wrong direction looks like a loss on one side of a transmitter, so regions are tested last.
     on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)

@@ -166,6 +166,7 @@ def _write_report(result: Result, out: Path, output: Output) -> list[str]:
 
         folder = out / page.FIGURES if output.figures else None
         with progress_bars(log()) as progress:
+            progress("writing", 0, None)
             page.report(
                 result, out / page.FILE, figures=folder, overwrite=output.overwrite, progress=progress
             )

@@ -81,6 +81,8 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
     starts = problem.parameters.to_search(problem.parameters.start)[None]
     faint, margin = np.zeros(len(limit), dtype=bool), MARGIN
     fewest = LINKS_PER_UNKNOWN * (objective.num_counted - problem.freedom)
+    if progress is not None:
+        progress("choosing links", 0, SELECTIONS)
     for turn in range(SELECTIONS):
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
         starts = fit.minima[:SEARCHES]

@@ -48,7 +48,7 @@ from calibray.scenes import read_triangles
 from calibray.study import Setup
 from calibray.study.calibration_sections import OFFSET
 from calibray.support.messages import percent
-from calibray.support.progress import Progress
+from calibray.support.progress import Progress, start_stage
 from calibray.uncertainty.draws import evenly_spaced
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
@@ -84,7 +84,7 @@ def suggest(
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
         count: Largest number of suggestions; a warning is logged if there are fewer.
-        progress: Called with the stage "tracing" after every launch.
+        progress: Called with the name of each stage, the completed work and the total.
         allow_changed_inputs: Continue even if a file of the scene or an antenna, or the links have changed since the
             calibration.
         observables: Also report which further observable is worth measuring at each suggestion.
@@ -116,6 +116,7 @@ def suggest(
             f"{study.path}: the result has no draws from the posterior; calibrate on the engine 'replay', with more "
             "links than unknowns"
         )
+    start_stage(progress, "reading scene and links")
     links = as_links(result, candidates)
     warn_of_carriers(result, links)
     calibrated = Setup.open(study).placed_at(result.parameters, NEIGHBOURS)
@@ -145,6 +146,7 @@ def suggest(
     margin_db = model.floor_margin_db()
     reached = _received(result, links, predicted[: model.num_draws].mean(axis=0), reached, margin_db)
     errors = replace(errors, common=errors.common[reached], position=errors.position[reached])
+    start_stage(progress, "choosing candidates")
     beliefs = model.beliefs()
     outlooks = choose_candidates(beliefs, predicted[:, reached], slope[:, reached], errors, count)
     if len(outlooks) < count:
@@ -212,12 +214,13 @@ class _ReplayedDraws:
     Args:
         result: The calibration.
         setup: The opened study of the calibration.
-        progress: Called with the stage "tracing" after every launch.
+        progress: Called with the name of each stage, the completed work and the total.
     """
 
     def __init__(self, result: Record, setup: Setup, progress: Progress | None) -> None:
         self.result, self.progress = result, progress
         self.engine = self._engine(setup)
+        start_stage(progress, "evaluating draws")
         problem = _as_calibrated(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
         # Constants of the scene have tight priors, so they take no degrees of freedom from the residuals.
@@ -253,7 +256,9 @@ class _ReplayedDraws:
         to the unit cube's coordinates, for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
         """
         objective, links = self.problem.objective, setup.links
-        loss, slope = self._replay(self._engine(setup))
+        engine = self._engine(setup)
+        start_stage(self.progress, "evaluating candidates")
+        loss, slope = self._replay(engine)
         if objective.ceiling_db is not None:
             slope[loss >= objective.ceiling_db] = 0.0
             loss = objective.capped(loss)

@@ -11,6 +11,17 @@ An interim result follows the name of the stage after a colon: "calibrating: bes
 """
 
 
+def start_stage(progress: Progress | None, stage: str) -> None:
+    """Report the start of a stage whose amount of work is unknown.
+
+    Example:
+        >>> start_stage(lambda *parts: print(*parts), "writing")
+        writing 0 None
+    """
+    if progress is not None:
+        progress(stage, 0, None)
+
+
 def with_stage(progress: Progress | None, stage: str) -> Progress | None:
     """Report progress under a different stage name, such as "checking" for a trace that checks another trace.
 

@@ -28,7 +28,7 @@ from calibray.result.verdict import (
     Verdict,
 )
 from calibray.support.memory import single_blas_thread
-from calibray.support.progress import Progress
+from calibray.support.progress import Progress, start_stage
 from calibray.uncertainty.buildings import can_split
 from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
@@ -110,8 +110,8 @@ def certainty(
 ) -> Certainty:
     """Assess the uncertainty of a calibration from its finished search.
 
-    `model` is the replay of the study's scene, if the search used one as a cheap model. The stage of `progress` is
-    "drawing".
+    `model` is the replay of the study's scene, if the search used one as a cheap model. The stages of `progress` are
+    "finding minima", "drawing" and "judging intervals".
     """
     started = time.perf_counter()
     # With few links, matrices are small, and BLAS threads cost more time than they save.
@@ -190,6 +190,7 @@ def _assess(
     local = local_intervals(problem, trail, optimum)
     if optimum.value[0] < EXACT_DB:
         return Certainty(Uncertainty(with_reason(local, Reason(ReasonKind.NO_NOISE))))
+    start_stage(progress, "finding minima")
     minima, squares = find_minima(problem, trail)
     relevant, least = relevant_minima(minima, squares, freedom), float(squares.min())
     offset = fit_undeclared_offset(problem, relevant, least, freedom)
@@ -203,6 +204,7 @@ def _assess(
         return Certainty(replace(record, intervals=with_reason(local, reason)))
     models = [joint_model(engine, relevant[0], least, freedom) for engine in engines]
     model, posterior = models[0], _draw(models, problem.setup.study.method.seed, progress)
+    start_stage(progress, "judging intervals")
     noise = _noise_weights(model, posterior, offset=not has_offset(problem))
     intervals = _intervals(problem, model, posterior, local)
     best = problem.parameters.named(trail.best)

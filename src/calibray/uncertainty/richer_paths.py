@@ -24,7 +24,7 @@ from calibray.optimizers import LeastSquares
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study.displacement import displaces
-from calibray.support.progress import Progress, with_stage
+from calibray.support.progress import Progress, start_stage, with_stage
 from calibray.uncertainty.assessment import EXACT_DB, Certainty, certainty
 from calibray.uncertainty.remarks import LIKELY
 from calibray.uncertainty.verdicts import consistent
@@ -69,6 +69,7 @@ def assess_richer_paths(
     except (InputError, EngineError) as error:  # for example too many paths; the calibration is finished
         _LOG.warning("paths with %s could not be tried: %s", " and ".join(changes), error)
         return assessed
+    start_stage(progress, "fitting more paths")
     richer = replace(problem, setup=setup, engine=replay(setup, paths))
     counted = problem.objective.weight > 0
     if not np.isfinite(richer.engine.path_loss(trail.best[None])[0][counted]).all():

@@ -127,6 +127,8 @@ def validate_problem(
     links, objective = problem.setup.links, problem.objective
     block, labels = _divide(problem, blocks, by)
     _announce_new_groups(problem, block)
+    if progress is not None:
+        progress("validating", 0, len(labels))
     all_link_minima = {name: minima for name, (_, minima) in fit_variants(problem, known_minima).items()}
     errors: dict[str, NDArray[np.float64]] = {}
     gaps = {observable.name: np.full((len(MODELS), len(links)), np.nan) for observable in problem.observed}
