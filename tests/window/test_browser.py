@@ -234,7 +234,7 @@ def test_a_hostile_upload_is_refused(walked, tmp_path):
     bad = tmp_path / "<b>x.csv"
     shutil.copy(EXAMPLES / "rss.csv", bad)
     step(page, "Map or plan").locator("input[type=file]").first.set_input_files(bad)
-    page.get_by_text("use letters, digits").wait_for()
+    page.get_by_text("use only letters, digits").wait_for()
     assert not (folder / "<b>x.csv").exists()
 
 
