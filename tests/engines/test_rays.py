@@ -245,6 +245,33 @@ def test_letter_case_and_blanks_of_names_and_types_do_not_matter(
     np.testing.assert_array_equal(path_loss(read(loud, yard)), path_loss(read(rows, yard)))
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [(name, "power_db") for name in ("received power (dBm)", "path loss [dB]", "pl_db", "prx_dbm", "rx_power", "rssi",
+     "channel_gain_db", "a_db", "amplitude", "magnitude_db")] + [("h_re", "gain_real"), ("Excess-Delay", "delay")],
+)  # fmt: skip
+def test_a_quantity_is_recognised_anywhere_in_the_name_of_a_column(name: str, meant: str) -> None:
+    with pytest.raises(InputError, match=f"did you mean '{meant}'"):
+        RayTable.of(SourceTable(direct_paths(["1"]).rename(columns={"power_db": name})))
+
+
+def test_blanks_and_brackets_of_names_count_as_underscores() -> None:
+    table = direct_paths(["1"])
+    renamed = RayTable.of(SourceTable(table.rename(columns={"power_db": "Power [dB]"})))
+    assert renamed.power == RayTable.of(SourceTable(table)).power
+
+
+@pytest.mark.parametrize(
+    ("antennas", "assumed"), [(None, "isotropic antennas of both"), (ANTENNAS, "the stated")]
+)
+def test_a_table_without_powers_is_announced(yard: Tracer, caplog, antennas, assumed: str) -> None:
+    read(direct_paths(["1"]).drop(columns="power_db"), yard, antennas=antennas)
+    assert (
+        f"states no power for its paths, so path loss is computed with the materials of the scene and {assumed}"
+        in (caplog.text)
+    )
+
+
 def test_columns_that_resemble_no_absent_one_are_ignored(yard: Tracer, rows: pd.DataFrame) -> None:
     more = rows.assign(power_dbm=7.0, delay_spread=1.0, material_id=3, line="a", phase=0.0)
     np.testing.assert_array_equal(path_loss(read(more, yard)), path_loss(read(rows, yard)))

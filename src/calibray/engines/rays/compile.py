@@ -118,6 +118,13 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
             f"{table.source}: diffuse reflections require the power of the path, because the solid angle of their rays "
             "is unknown; add power_db"
         )
+    else:
+        unknown = "isotropic antennas of both polarizations"
+        _LOG.warning(
+            "%s: states no power for its paths, so path loss is computed with the materials of the scene and %s; add "
+            "power_db to use the engine's powers",
+            table.source, unknown if setting.antennas is None else "the stated antennas",
+        )  # fmt: skip
     return paths if chosen is None else take_links(paths, chosen)
 
 

@@ -44,9 +44,13 @@ OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
 """Optional columns of a table; unknown names are compared with these, because a misspelt name would be ignored."""
 
 QUANTITIES: Final = {
-    "power": "power_db", "gain": "power_db", "loss": "power_db", "delay": "delay", "material": "material",
-}  # fmt: skip
-"""Beginnings of column names, and the column that each probably refers to."""
+    "gain_real": r"\b(re|real)\b",
+    "gain_imag": r"\b(im|imag|imaginary)\b",
+    "power_db": r"power|gain|loss|amplitude|magnitude|rssi|rsrp|\b(pl|pg|prx|db|dbm|dbw)\b",
+    "delay": "delay",
+    "material": "material",
+}
+"""Patterns in column names, with blanks instead of separators, and the column that each probably refers to."""
 
 MISSPELT: Final = 0.8
 """Smallest similarity at which an unknown column is considered misspelt; `line` is not considered a misspelt `link`."""
@@ -187,14 +191,14 @@ def _with_known_names(table: SourceTable) -> SourceTable:
     """The table with the documented names of its known columns; names that seem to be misspelt are refused."""
     known = (*REQUIRED, *OPTIONAL)
     given = [str(name) for name in table.frame]
-    names = [name if (name := text.strip().casefold()) in known else text for text in given]
+    names = [name if (name := _plain(text)) in known else text for text in given]
     absent = {*OPTIONAL} - {*names}
     if len(absent & {*POWERS}) < len(POWERS):
         absent -= {*POWERS}
     for text, name in zip(given, names, strict=True):
         if name in known and names.count(name) > 1:
             raise InputError(f"{table.source}: has {names.count(name)} columns {name!r}; keep one of them")
-        if name not in known and (meant := _meant(name.strip().casefold(), absent)):
+        if name not in known and (meant := _meant(text, absent)):
             raise InputError(
                 f"{table.source}: column {shortened(text)!r} is unknown and would be ignored; did you mean {meant!r} "
                 "(docs/reference/ray-table.md)? Use this name and its unit, or remove the column"
@@ -207,12 +211,18 @@ def _with_known_names(table: SourceTable) -> SourceTable:
     return replace(table, frame=table.frame.set_axis(names, axis=1))
 
 
+def _plain(name: str) -> str:
+    """A column name in lower case, with underscores instead of blanks and brackets."""
+    return re.sub(r"[\s_()\[\]{}]+", "_", name.casefold()).strip("_")
+
+
 def _meant(name: str, absent: set[str]) -> str | None:
     """The absent column that an unknown name probably refers to, or None."""
-    quantity = re.match(rf"(?:path_?|received_?)?({'|'.join(QUANTITIES)})", name)
-    if quantity and (known := QUANTITIES[quantity[1]]) in absent:
-        return known
-    return next(iter(get_close_matches(shortened(name), sorted(absent), n=1, cutoff=MISSPELT)), None)
+    words = re.sub(r"[\W_]+", " ", name.casefold())
+    for known, pattern in QUANTITIES.items():
+        if known in absent and re.search(pattern, words):
+            return known
+    return next(iter(get_close_matches(shortened(_plain(name)), sorted(absent), n=1, cutoff=MISSPELT)), None)
 
 
 def _kinds(
