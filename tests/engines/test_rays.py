@@ -512,7 +512,9 @@ def test_an_offset_of_all_direct_paths_is_named(yard: Tracer, rows: pd.DataFrame
     read(rows, yard, antennas=None)
     assert not caplog.records
     read(rows.assign(power_db=rows.power_db + 30), yard, antennas=None)  # dBm
-    assert "check that power_db is the path gain" in caplog.text
+    assert "check that power_db is the path gain, not received power" in caplog.text
+    read(rows.assign(power_db=2 * rows.power_db), yard, antennas=None)
+    assert "below free space between isotropic antennas (median): check that power_db is the" in caplog.text
 
 
 def test_antennas_of_a_study_are_those_of_the_table(tmp_path: Path) -> None:

@@ -52,7 +52,8 @@ a few rounding errors of a field in single precision, as in Sionna RT.
 """
 
 HIGH_GAIN_DB: Final = 25.0
-"""Total gain of both antennas above which a warning is issued [dB], such as 18 dBi at one end and 7 dBi at the other.
+"""Median total gain of unknown antennas above which, or below minus which, a warning is issued [dB]. 18 dBi at one
+end and 7 dBi at the other reach it.
 """
 
 
@@ -368,11 +369,14 @@ def _check_direct(
             f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains{common}"
             + ("; omit the antennas if they are not those of the engine" if known else "")
         )
-    if direct.any() and (typical := float(np.median(off[direct]))) > HIGH_GAIN_DB:
+    if direct.any() and abs(typical := float(np.median(off[direct]))) > HIGH_GAIN_DB:
+        side, mistake = "above", "received power, an amplitude in dB or path loss"
+        if typical < 0:
+            side, mistake = "below", "twice its decibels (20 log10 of the power)"
         _LOG.warning(
-            "%s: direct paths are %.0f dB above free space between isotropic antennas (median): check that power_db is "
-            "the path gain, not received power, an amplitude in dB or path loss",
-            table.source, typical,
+            "%s: direct paths are %.0f dB %s free space between isotropic antennas (median): check that power_db is "
+            "the path gain, not %s",
+            table.source, abs(typical), side, mistake,
         )  # fmt: skip
 
 
