@@ -263,6 +263,26 @@ def test_aodt_s_gains_are_those_of_the_paths_time(lines: list[Polyline], tmp_pat
     np.testing.assert_allclose(path_loss(read(folder)), path_loss(expected))
 
 
+@pytest.mark.parametrize("given", ["list", "folder"])
+def test_several_files_of_insite_are_read_together(lines: list[Polyline], tmp_path: Path, given: str) -> None:
+    """A joined file is refused, because the number of receivers in its first line is that of the first file."""
+    groups = by_receiver(lines)
+    files = []
+    for number, part in enumerate((groups[0], [line for group in groups[1:] for line in group])):
+        file = write_insite(part, tmp_path)
+        files.append(file.rename(tmp_path / f"street.paths.t001_0{number}.r002.p2m"))
+    (tmp_path / "street.power.t001_01.r002.p2m").write_text("# no paths")
+    together = read(files if given == "list" else tmp_path, tx_power_dbm=TX_POWER_DBM)
+    assert (together.num_links, together.num_paths) == (len(groups), len(lines))
+    joined = tmp_path / "joined.p2m"
+    joined.write_text("\n".join(file.read_text() for file in files))
+    number = len(files[0].read_text().splitlines()) + 2
+    with pytest.raises(
+        InputError, match=rf"joined\.p2m, line {number}: '3' follows the last receiver.* in line 2;"
+    ):
+        read(joined, tx_power_dbm=TX_POWER_DBM)
+
+
 def without_a_gain(folder: Path) -> None:
     gains = pd.read_parquet(folder / "cirs.parquet")
     gains.at[0, "cir_re"] = np.array([np.nan, *gains.cir_re[0][1:]])
@@ -288,6 +308,7 @@ REFUSED = {
         {"tx_power_dbm": 13.0},
         "ends within a path|must be",
     ),
+    "a missing file": (write_insite, Path.unlink, {"tx_power_dbm": 13.0}, "no such file"),
     "foliage": (
         write_insite,
         lambda file: file.write_text(file.read_text().replace("Tx-R-Rx", "Tx-X-Rx", 1)),

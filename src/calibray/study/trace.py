@@ -145,8 +145,8 @@ def read_rays(
 
     Args:
         rays: The ray table: a .csv, .parquet, .json or .h5 file, or a DataFrame of its rows. Alternatively, the paths
-            of another program: a .p2m file of Wireless InSite, the folder of an AODT run or a DeepMIMO scenario, or the
-            `Paths` of Sionna RT.
+            of another program: a .p2m file of Wireless InSite or a list or folder of them, the folder of an AODT run or
+            a DeepMIMO scenario, or the `Paths` of Sionna RT.
         scene: Mitsuba XML file, `sionna:NAME`, or a `Scene`, with the constants that the engine used. Alternatively, a
             study, which states carrier and links and must have the start values that the engine used.
         frequency: Carrier frequency [Hz]; only without a study.

@@ -80,12 +80,14 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     """
     if tx_power_dbm is not None and not (isinstance(tx_power_dbm, Real) and np.isfinite(tx_power_dbm)):
         raise InputError(f"tx_power_dbm = {tx_power_dbm!r}: must be a finite number, in dBm")
-    insite = isinstance(rays, str | Path) and Path(rays).suffix.lower() == ".p2m"
+    insite = _insite_files(rays)
     if tx_power_dbm is not None and not insite:
         raise InputError(
             f"tx_power_dbm = {tx_power_dbm:g}: applies only to Wireless InSite files (.p2m); in a table, subtract it "
             "from the received power, so that power_db is the path gain"
         )
+    if insite:
+        return read_insite(insite, tx_power_dbm)
     if isinstance(rays, pd.DataFrame):
         return SourceTable(rays)
     if isinstance(rays, Mapping):
@@ -97,11 +99,9 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     if not isinstance(rays, str | Path):
         raise InputError(
             f"rays: is a {type(rays).__name__}; must be a DataFrame, a dict with one list per column, the name of a "
-            "file or folder, or the Paths of Sionna RT"
+            "file or folder, a list of .p2m files, or the Paths of Sionna RT"
         )
     path = Path(rays)
-    if insite and path.is_file():
-        return read_insite(path, tx_power_dbm)
     if not path.is_dir():
         return read_ray_file(path)
     if is_deepmimo(path):
@@ -109,8 +109,8 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
     if (path / AODT_FILES[0]).is_file():
         return read_aodt(path)
     raise InputError(
-        f"{path}: a folder must contain {' and '.join(AODT_FILES)} (AODT) or power_t*.mat (DeepMIMO); "
-        "otherwise give a file"
+        f"{path}: a folder must contain {' and '.join(AODT_FILES)} (AODT), power_t*.mat (DeepMIMO) or {INSITE_NAMES} "
+        "(Wireless InSite); otherwise give a file"
     )
 
 
@@ -118,8 +118,24 @@ INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "
 """Types of interactions by letter; foliage (F, X) is refused, because it is not a surface with a material."""
 
 
-def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
-    """Read the paths of one transmitter from a text file `*.paths.*.p2m` of Remcom Wireless InSite.
+INSITE_NAMES: Final = "*.paths.*.p2m"
+"""Names of the files in a folder that contain paths; others contain powers or delays of links."""
+
+
+def _insite_files(rays: Any) -> list[Path]:
+    """The files of Wireless InSite that are given by name, in a list or by their folder; empty for other rays."""
+    if isinstance(rays, str | Path):
+        if (path := Path(rays)).is_dir():
+            others = is_deepmimo(path) or (path / AODT_FILES[0]).is_file()
+            return [] if others else sorted(path.glob(INSITE_NAMES))
+        rays = [path]
+    given = rays if isinstance(rays, list | tuple) else []
+    files = [Path(item) for item in given if isinstance(item, str | Path)]
+    return files if len(files) == len(given) and all(file.suffix.lower() == ".p2m" for file in files) else []
+
+
+def read_insite(files: Sequence[Path], tx_power_dbm: float | None) -> SourceTable:
+    """Read the paths in text files `*.paths.*.p2m` of Remcom Wireless InSite, each with one transmitter.
 
     Lines that begin with # are comments. The first line contains the number of receivers. Each receiver has a line with
     its index and its number of paths, followed by a line of totals if there are any paths. Each path has a line of nine
@@ -127,12 +143,21 @@ def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
     or of eight numbers without the phase. A line such as Tx-R-D-Rx and a line for each point follow.
 
     Raises:
-        InputError: The transmitted power is missing, the file is malformed, or a path crosses foliage.
+        InputError: The transmitted power is missing, a file does not exist or is malformed, or a path crosses foliage.
     """
     if tx_power_dbm is None:
         raise InputError(
-            f"{file}: contains received power in dBm; give tx_power_dbm, the transmitted power of the project"
+            f"{files[0]}: contains received power in dBm; give tx_power_dbm, the transmitted power of the project"
         )
+    others = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return rows_of(
+        (path for file in files for path in _insite_file(file, tx_power_dbm)), f"{files[0]}{others}"
+    )
+
+
+def _insite_file(file: Path, tx_power_dbm: float) -> list[Polyline]:
+    if not file.is_file():
+        raise InputError(f"{file}: no such file")
     lines = [
         (number, line.strip())
         for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
@@ -140,11 +165,17 @@ def read_insite(file: Path, tx_power_dbm: float | None) -> SourceTable:
     ]
     rest = iter(lines)
     try:
-        return rows_of(_insite_paths(file, rest, tx_power_dbm), str(file))
+        paths = _insite_paths(file, rest, tx_power_dbm)
     except StopIteration:
         raise InputError(
             f"{file}: ends within a path; export it again, or check that it is a paths file"
         ) from None
+    for number, text in rest:
+        raise InputError(
+            f"{file}, line {number}: {shortened(text)!r} follows the last receiver, according to the number of "
+            f"receivers in line {lines[0][0]}; correct this number, or give a list of unjoined files"
+        )
+    return paths
 
 
 def _insite_paths(file: Path, rest: Iterator[tuple[int, str]], tx_power_dbm: float) -> list[Polyline]:
