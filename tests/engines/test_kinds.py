@@ -16,6 +16,7 @@ import planted
 from calibray.engines.kinds import KINDS
 from calibray.errors import InputError
 from calibray.study import Study
+from calibray.study.toml_file import study_text
 
 FREE_SPACE = '''
 """Free space with one unknown loss: the smallest engine there could be."""
@@ -139,3 +140,22 @@ def test_keys_of_another_engine_wait_until_it_is_chosen(tmp_path):
 def test_keys_of_another_engine_are_checked_all_the_same(tmp_path, key, value, message):
     with pytest.raises(InputError, match=message):
         study(tmp_path, name="replay", **{key: value})
+
+
+@pytest.mark.parametrize("name", [{}, {"name": "replay"}, {"name": "retrace"}])
+def test_a_shared_key_with_the_value_of_an_engine_that_is_not_described_is_refused(tmp_path, name):
+    """Such a study would trace instead of calling the program."""
+    with pytest.raises(InputError, match=r"engine\.rays = true: .*or set engine\.name = 'command'"):
+        study(tmp_path, rays=True, **name)
+    assert study(tmp_path, rays=True, command=["model"], **name).replace(engine="command").engine.exports_rays
+
+
+def test_a_shared_key_without_effect_is_announced(tmp_path, caplog):
+    plan = study(tmp_path, name="replay", rays="links.csv", command=["model"])
+    (tmp_path / "study.toml").write_text(study_text(plan.replace(engine="command").content(), {}))
+    assert not caplog.records
+    Study.load(tmp_path / "study.toml")
+    assert (
+        "engine.rays = 'links.csv' has no effect with engine.name = 'command'; correct or remove it"
+        in caplog.text
+    )

@@ -26,7 +26,7 @@ from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.calibration_sections import OFFSET, NuisanceTerm
 from calibray.study.content import BUNDLED, StudyContent
 from calibray.study.regions import PREFIX
-from calibray.study.toml_file import expand, read_content, refuse_unquoted_names, split_engine_keys
+from calibray.study.toml_file import expand, is_shared, read_content, refuse_unquoted_names, split_engine_keys
 from calibray.support.messages import shortened, type_name
 from calibray.support.output_files import as_path, exists
 from calibray.support.strict_models import dotted, explain
@@ -58,6 +58,11 @@ class StudyModel(StudyContent, ABC):
         study.check_files()
         for key, needed in _keys_without_effect(content):
             _LOG.warning("%s: %s has no effect without %s; remove it", path, key, needed)
+        if len(others := study._other_engines) == 1 and is_shared(key := next(iter(others))):
+            _LOG.warning(
+                "%s: engine.%s = %r has no effect with engine.name = %r; correct or remove it",
+                path, key, others[key], study.engine.name,
+            )  # fmt: skip
         return study
 
     @classmethod

@@ -167,7 +167,8 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
     A study can state the command of a program and use replay; `calibray run --engine command` then calls the program.
 
     Raises:
-        InputError: The value of a key of another engine is invalid.
+        InputError: The value of a key of another engine is invalid. Or engines share the key, and only an engine that
+            the table does not describe accepts the value.
     """
     # The study's own validation rejects a value that is not a table or does not name an engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
@@ -175,15 +176,38 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
         return content, {}
     own, others = KINDS[name].model_fields, {}
     for key, value in content.items():
-        fields = [kind.model_fields[key] for kind in KINDS.values() if key in kind.model_fields]
-        faults = [_fault(field, value) for field in fields]
+        faults = {
+            kind: _fault(section.model_fields[key], value)
+            for kind, section in KINDS.items()
+            if key in section.model_fields
+        }
+        fitting = [kind for kind, fault in faults.items() if fault is None]
         # Engines may share a key, such as `rays`, for values of different types.
-        if fields and (key not in own or (_fault(own[key], value) is not None and None in faults)):
-            if None not in faults:
-                raise InputError(f"{source}: engine.{key} = {shortened(repr(value))}: {faults[0]}")
+        if faults and (key not in own or (faults[name] is not None and fitting)):
+            if not fitting:
+                raise InputError(
+                    f"{source}: engine.{key} = {shortened(repr(value))}: {next(iter(faults.values()))}"
+                )
+            if is_shared(key) and not any(_described(kind, content) for kind in fitting):
+                given, fault = json.dumps(value, default=str), faults.get(name, "unknown key")
+                raise InputError(
+                    f"{source}: engine.{key} = {shortened(given)}: {fault} with "
+                    f"engine.name = {name!r}; correct or remove it, or set engine.name = {fitting[0]!r}"
+                )
             others[key] = value
     rest = {key: value for key, value in content.items() if key not in others}
     return {"name": DEFAULT, **rest}, others
+
+
+def is_shared(key: str) -> bool:
+    """Whether several engines have a key."""
+    return sum(key in section.model_fields for section in KINDS.values()) > 1
+
+
+def _described(kind: str, content: Mapping[str, Any]) -> bool:
+    """Whether the table states a key that only this engine has; the default engine needs none."""
+    own = KINDS[kind].model_fields
+    return kind == DEFAULT or any(key in own and not is_shared(key) for key in content)
 
 
 def _fault(field: FieldInfo, value: Any) -> str | None:
