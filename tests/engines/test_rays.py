@@ -288,6 +288,12 @@ def test_a_dictionary_of_columns_is_a_table_and_paths_are_not(
         read(traced, yard)
 
 
+@pytest.mark.parametrize("paths", ["rays.csv", None])
+def test_only_paths_are_written(paths: object, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"write_rays: paths is .*, must be Paths"):
+        cb.write_rays(paths, tmp_path / "rays.csv")
+
+
 def test_a_response_that_is_not_a_table_names_the_format(rows: pd.DataFrame, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"begins with 'path,.*must be JSON or HDF5, not CSV"):
         parse_rays(rows.to_csv(index=False).encode(), "its response")

@@ -203,6 +203,10 @@ def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> No
     replaced.
 
     Raises:
-        InputError: The file cannot be written.
+        InputError: `paths` are not Paths, or the file cannot be written.
     """
+    if not isinstance(paths, Paths):
+        raise InputError(
+            f"write_rays: paths is a {type_name(paths)}, must be Paths; use calibray.read_rays or calibray.trace first"
+        )
     write_ray_file(file, rays_of(paths).frame(), overwrite)
