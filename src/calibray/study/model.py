@@ -345,9 +345,10 @@ class StudyModel(StudyContent, ABC):
         """
         for name, stated, file in self._named_files():
             if not exists(file):
+                remedy = "; to write it, use a study without engine.rays: calibray.read_rays and calibray.write_rays"
                 raise InputError(
                     f"{self._path}: {name} = {shortened(stated)!r}: no such file, "
-                    f"{shortened(str(file.absolute()), 300)}"
+                    f"{shortened(str(file.absolute()), 300)}{remedy if name == 'engine.rays' else ''}"
                 )
 
     def _named_files(self) -> list[tuple[str, str, Path]]:
