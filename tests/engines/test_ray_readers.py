@@ -336,7 +336,7 @@ REFUSED = {
         write_deepmimo,
         lambda folder: (folder / "inter_t001_tx000_r002.mat").unlink(),
         {},
-        "inter_t001",
+        r"inter_t001_tx000_r002\.mat: no such file",
     ),
     "no matrix": (
         write_deepmimo,

@@ -403,6 +403,8 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
 
 def _matrix(file: Path) -> NDArray[np.float64]:
     """The only matrix in a file."""
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; export the scenario again, with all of its matrices")
     try:
         if file.suffix == ".npz":
             with ZipFile(file) as parts:
