@@ -141,6 +141,15 @@ def test_a_second_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
     assert Result.load(folder / "out").cost.ledger_hits == 3
 
 
+def test_a_validation_in_the_folder_of_the_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
+    folder, _ = finished
+    before = calls(folder)
+    validated = run("validate", folder / "study.toml", "--out", folder / "out", "--blocks", "2")
+    assert validated.exit_code == 0, validated.output
+    assert calls(folder) == before
+    assert "RT calls that are in" in " ".join(validated.output.split())
+
+
 def test_predictions_and_the_page_show_the_rays_of_the_program(
     finished: tuple[Path, str], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

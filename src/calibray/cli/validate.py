@@ -60,7 +60,7 @@ def validate(
 ) -> None:
     """Calibrate without each block of links in turn, and compare models on the held-out block."""
     with progress_bars(log()) as progress:
-        from calibray.engines import open_workers
+        from calibray.engines import LEDGER_FILE, open_workers
         from calibray.result.files import RESULT_FILE, VALIDATION_FILE, check_same_study, write_validation
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
@@ -74,10 +74,14 @@ def validate(
         setup = study.opened() if division.by is None else None
         if setup is not None and out is not None and (out / RESULT_FILE).is_file():
             _check_same_inputs(setup, out)
+        ledger = None if out is None else out / LEDGER_FILE
+        if ledger is not None and study.engine.expensive and ledger.is_file():
+            echo(f"RT calls that are in {ledger} are not repeated", err=True)
         with open_workers(pool.workers, pool.scheduler) as workers:
             validation = run_validation(
-                setup or study, blocks=division.blocks, by=division.by, workers=workers, progress=progress
-            )
+                setup or study, blocks=division.blocks, by=division.by, workers=workers, progress=progress,
+                ledger=ledger,
+            )  # fmt: skip
     echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)

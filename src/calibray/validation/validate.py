@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Integral
+from pathlib import Path
 from typing import Final, cast
 
 import numpy as np
@@ -52,6 +53,7 @@ def validate(
     workers: Workers | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
+    ledger: str | Path | None = None,
 ) -> Validation:
     """Compare models on held-out links: each block of links is left out in turn and predicted.
 
@@ -63,6 +65,8 @@ def validate(
         workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
         progress: Called with the name of each stage, the work done and the total.
         tracer: Function that opens the scene in a ray tracer; not used for a study that is already open.
+        ledger: SQLite file that stores RT calls, such as `ledger.sqlite` in the folder of a run, for a program that
+            answers with rays; calls in it are not repeated.
 
     Returns:
         Held-out errors of every model, with a table and a conclusion.
@@ -85,7 +89,7 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    engine = engines.make(setup, progress=progress, workers=workers)
+    engine = engines.make(setup, None, progress, ledger, workers)
     if maps_rays(setup):
         exporting = Exporting(cast(Answering, engine), setup)
         problem, *_ = search_rays(Problem.of(setup, exporting), exporting, progress)
