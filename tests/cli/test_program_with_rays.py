@@ -205,8 +205,11 @@ def test_a_program_of_other_physics_is_not_understood(
     assert "The model does not represent the program" in output
     assert "the optimum may be missed" in output
     content = cb.Study.load(study).content() | {"method": {"name": "auto", "options": {"budget": 2}}}
-    with pytest.raises(InputError, match=r"method\.options\.budget = 2; it must be a whole number >= 3"):
+    with pytest.raises(
+        InputError, match=r"needs two calls.*method\.options\.budget = 2; it must be a whole number >= 3"
+    ):
         cb.calibrate(cb.Study.from_content(content, study))
+    assert calls(study.parent) == 3
 
 
 def test_a_result_of_calls_without_a_common_path_is_loaded_and_states_the_reason(tmp_path: Path) -> None:

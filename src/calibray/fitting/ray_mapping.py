@@ -132,8 +132,22 @@ class RayMap:
 
 
 def maps_rays(setup: Setup) -> bool:
-    """Whether a study is calibrated by ray mapping: its method is `auto`, and its program returns rays."""
-    return setup.study.engine.exports_rays and setup.study.method.name == AUTO
+    """Whether a study is calibrated by ray mapping: its method is `auto`, and its program returns rays.
+
+    Raises:
+        InputError: The study's budget is too small for ray mapping.
+    """
+    mapped = setup.study.engine.exports_rays and setup.study.method.name == AUTO
+    if mapped:
+        _most_calls(setup)
+    return mapped
+
+
+def _most_calls(setup: Setup) -> int:
+    budget = setup.study.method.options.get("budget", MOST_CALLS)
+    reason = "ray mapping needs two calls to identify the program's assumptions, and one at the minimum"
+    name = f"{setup.study.path}: {reason}; method.options.budget"
+    return min(whole(name, budget, at_least=LEAST_CALLS), MOST_CALLS)
 
 
 def search_rays(
@@ -149,11 +163,7 @@ def search_rays(
         EngineError: A call failed.
     """
     started, trail, method = time.perf_counter(), Trail(), problem.setup.study.method
-    name, budget = (
-        f"{problem.setup.study.path}: method.options.budget",
-        method.options.get("budget", MOST_CALLS),
-    )
-    most_calls = min(whole(name, budget, at_least=LEAST_CALLS), MOST_CALLS)
+    most_calls = _most_calls(problem.setup)
 
     def ask(candidate: NDArray[np.float64]) -> Export:
         export = engine.export(candidate)
