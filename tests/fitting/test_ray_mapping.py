@@ -414,6 +414,25 @@ def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: For
     assert not mapped.understood
 
 
+def test_a_link_that_loses_its_paths_at_the_minimum_ends_the_calls_and_is_named(foreign: Foreign) -> None:
+    """The objective is infinite there, so further calls at the minimum would be useless."""
+    calls = 0
+
+    def ask(candidate: np.ndarray) -> Export:
+        nonlocal calls
+        calls += 1
+        table = foreign.rays(candidate)
+        kept = np.flatnonzero(foreign.paths.link != 1) if calls > 2 else np.arange(len(table.path))
+        return Export.of_table(table.take(kept), RaySetting.of(foreign.problem.setup))
+
+    mapped = map_rays(foreign.problem, ask)
+    assert calls == len(mapped.calls) == 4
+    row = foreign.problem.setup.links.row[1]
+    text = remark_text(ray_mapping._remark(mapped, foreign.problem))
+    assert f"1 link has no path in some of the calls (row {row})" in text
+    assert 'set objective.no_path = "censor" and objective.ceiling_db' in text
+
+
 def test_a_link_that_the_replay_lacks_is_lost(foreign: Foreign, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = ray_fit.Understanding.replay
 
@@ -441,7 +460,7 @@ def test_paths_without_a_calibrated_material_do_not_show_that_the_model_represen
     assert mapped.understanding.misfit_db < 1e-6
     assert mapped.reached
     assert not mapped.understood
-    text = remark_text(ray_mapping._remark(mapped))
+    text = remark_text(ray_mapping._remark(mapped, foreign.problem))
     assert text.startswith("No path of the program interacts with a calibrated material")
 
 

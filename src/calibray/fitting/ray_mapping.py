@@ -180,7 +180,7 @@ def search_rays(
     mapped = map_rays(problem, ask, most_calls=most_calls, seed=method.seed)
     trail.minima = mapped.minima
     trail.rt_calls, trail.ledger_hits = len(trail.candidates), engine.hits
-    return with_engine(problem, mapped.engine), trail, _remark(mapped)
+    return with_engine(problem, mapped.engine), trail, _remark(mapped, problem)
 
 
 def map_rays(
@@ -190,7 +190,8 @@ def map_rays(
 
     The result contains the replay that replaces the engine, and its accuracy. Calls also continue if the minimum of the
     replay is not at the best call, because an accurate prediction of a short step does not show that the model is
-    accurate elsewhere. The engine is called through `ask`; the engine of `problem` is not called.
+    accurate elsewhere. They end if links have lost all paths in two successive calls at minima. The engine is called
+    through `ask`; the engine of `problem` is not called.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -218,7 +219,11 @@ def map_rays(
         if gap > tolerance_db and len(calls) < most_calls:
             continue
         mapped = _finish(problem, calls, known, understanding, gap)
-        if mapped.moved_db <= LEFT_DB or len(calls) >= most_calls:
+        # Links that lose their paths at the minimum make the objective infinite there, so no call can become the best.
+        repeated = (
+            all(np.isinf(_objective(problem, each)) for each in calls[-2:]) and len(calls) > LEAST_CALLS
+        )
+        if mapped.moved_db <= LEFT_DB or repeated or len(calls) >= most_calls:
             return mapped
         # The rays of the last call in this order are modelled.
         ordered, understanding = _best_last(problem, calls), mapped.understanding
@@ -323,7 +328,9 @@ def _changes(calls: list[Call]) -> tuple[int, float, int]:
     return changed, change_db, lost
 
 
-def _remark(mapped: RayMap) -> Remark:
+def _remark(mapped: RayMap, problem: Problem) -> Remark:
+    reached = np.isfinite([call.export.path_loss_db for call in mapped.calls])
+    sometimes = reached.any(axis=0) & ~reached.all(axis=0) & (problem.objective.weight > 0)
     understanding = mapped.understanding
     model, at_best = understanding.model, (mapped.best.candidate, understanding.values)
     constants, half_spaces = dict(model.described(*at_best)), model.half_spaces(*at_best)
@@ -345,6 +352,8 @@ def _remark(mapped: RayMap) -> Remark:
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,
             "lost": mapped.lost,
+            "lost_rows": problem.setup.links.row[sometimes].tolist(),
+            "excluded": problem.objective.ceiling_db is None,
             "half_space": bool(half_spaces) and not any(name.endswith(".thickness") for name in constants),
             "half_spaces": half_spaces,
             "names": list(constants),

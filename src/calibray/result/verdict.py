@@ -126,9 +126,9 @@ class RemarkKind(StrEnum):
     OUTSIDE_INTERVAL = "outside interval"
     FEW_DRAWS = "few draws"
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
-    # understood, reached, meets_calibrated (any path), calls, changed (paths), changed_db and lost (links), half_space
-    # (all surfaces), half_spaces (materials); names and values of constants; misfit_db, gap_db, remaining_db, moved_db
-    # if paths are in common
+    # understood, reached, meets_calibrated (any path), calls, changed (paths), changed_db and lost (links), lost_rows
+    # (of links without a path in some calls), excluded (whether such links are), half_space (all surfaces), half_spaces
+    # (materials); names and values of constants; misfit_db, gap_db, remaining_db, moved_db if paths are in common
     RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
     # when traced again: links that change by more than tolerance_db, of (all), largest_db; lost, the number of links

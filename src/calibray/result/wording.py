@@ -9,6 +9,7 @@ from calibray.result.held_out import Judgement, Model
 from calibray.result.record import Record
 from calibray.result.verdict import Cause, Interval, Reason, ReasonKind, Remark, RemarkKind
 from calibray.support.messages import counted, percent
+from calibray.tables import rows_text
 
 MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
@@ -308,6 +309,14 @@ def _ray_mapping(values: dict[str, Any]) -> str:
             f"link changes by up to {values['changed_db']:.2f} dB"
         )
         text += f", and {values['lost']} links have no path." if values.get("lost") else "."
+    if lost := values.get("lost_rows"):
+        text += f" {counted(len(lost), 'link')} {'has' if len(lost) == 1 else 'have'} no path in some of the calls "
+        text += f"({rows_text(lost)})."
+        if values["excluded"]:
+            text += (
+                ' Such a call cannot be the best one: set objective.no_path = "censor" and objective.ceiling_db, or '
+                "leave these links out."
+            )
     return text
 
 
