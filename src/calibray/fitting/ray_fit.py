@@ -23,7 +23,7 @@ from calibray.engines.rays.compile import powers
 from calibray.engines.rays.surfaces import TOLERANCE
 from calibray.engines.replay import Replay
 from calibray.fitting import ray_scan
-from calibray.fitting.ray_model import ANGLES, LEAST_DB, RANGES, TILT, Call, Ends, RayModel
+from calibray.fitting.ray_model import ANGLES, HALF_SPACE, LEAST_DB, RANGES, TILT, Call, Ends, RayModel
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
@@ -31,7 +31,7 @@ KEPT: Final = 3
 """Number of explanations that are kept from one material to the next."""
 
 EXACT_DB: Final = 0.005
-"""Misfit at which a search ends [dB]."""
+"""Misfit at which a search ends [dB]; smaller differences do not tell explanations apart."""
 
 KNOWN_DB: Final = 0.02
 """Misfit below which the explanation of earlier calls is kept for the next call [dB]; wrong minima had misfits of at
@@ -124,6 +124,30 @@ def understand(
         if before.misfit_db <= KNOWN_DB:
             return before
     return _search(first, ratios, last, before)
+
+
+def half_spaces(fit: Understanding, calls: list[Call]) -> tuple[str, ...]:
+    """Materials whose assumed thickness the ratios of the calls do not determine, as with half-spaces.
+
+    With a half-space in place of the slab, the misfit then increases by at most `EXACT_DB`.
+    """
+    last, ratios = calls[-1], ratios_of(calls)
+    if not ratios:
+        return ()
+    tables, weight = _tables(fit.model, ratios, last), sum(ratio.weight.sum() for ratio in ratios)
+
+    def misfit_db(values: NDArray[np.float64]) -> float:
+        return float(
+            np.linalg.norm(_errors(replace(fit, values=values), ratios, tables)[0]) / np.sqrt(weight)
+        )
+
+    most_db = misfit_db(fit.values) + EXACT_DB
+    thick = {
+        name: np.where(np.arange(len(fit.values)) == at, np.log(HALF_SPACE), fit.values)
+        for at, (name, field) in enumerate(fit.model.assumed)
+        if field == "thickness"
+    }
+    return tuple(name for name, values in thick.items() if misfit_db(values) <= most_db)
 
 
 def _search(

@@ -25,7 +25,7 @@ from calibray.engines.rays.export import Export, Exporting
 from calibray.engines.replay import Replay
 from calibray.errors import EngineError
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_fit import Understanding, common, understand
+from calibray.fitting.ray_fit import Understanding, common, half_spaces, understand
 from calibray.fitting.ray_model import Call, RayModel
 from calibray.fitting.search import AUTO, Trail, least_squares, local_searches
 from calibray.optimizers.arguments import whole
@@ -93,6 +93,7 @@ class RayMap:
         changed: Largest number of paths that occur in the best call but not in another call, or vice versa.
         changed_db: Largest change of a link's path loss if these paths are left out, over links that keep a path [dB].
         lost: Number of links that keep no path, or that have no path in the replay at the best call.
+        half_spaces: Materials whose thickness the calls do not determine.
         minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
         remaining_db: Objective on this replay at the best call minus that at the lowest of these minima [dB].
         moved_db: RMS over the links of the replay's path loss at that minimum minus that at the best call [dB].
@@ -106,6 +107,7 @@ class RayMap:
     changed: int
     changed_db: float
     lost: int
+    half_spaces: tuple[str, ...]
     minima: NDArray[np.float64]
     remaining_db: float
     moved_db: float
@@ -255,8 +257,9 @@ def _finish(
     lost = max(lost, int((np.isfinite(answered) & np.isinf(predicted)).sum()))
     moved = _distance(lowest, predicted)
     return RayMap(
-        replay, tuple(calls), best, final, gap, changed, changed_db, lost, found.minima, remaining, moved
-    )
+        replay, tuple(calls), best, final, gap, changed, changed_db, lost, half_spaces(final, ordered), found.minima,
+        remaining, moved,
+    )  # fmt: skip
 
 
 def _best_last(problem: Problem, calls: list[Call]) -> list[Call]:
@@ -332,8 +335,8 @@ def _remark(mapped: RayMap, problem: Problem) -> Remark:
     reached = np.isfinite([call.export.path_loss_db for call in mapped.calls])
     sometimes = reached.any(axis=0) & ~reached.all(axis=0) & (problem.objective.weight > 0)
     understanding = mapped.understanding
-    model, at_best = understanding.model, (mapped.best.candidate, understanding.values)
-    constants, half_spaces = dict(model.described(*at_best)), model.half_spaces(*at_best)
+    model = understanding.model
+    constants = model.described(understanding.values, mapped.half_spaces)
     levels = {
         "misfit_db": understanding.misfit_db,
         "gap_db": mapped.gap_db,
@@ -354,8 +357,9 @@ def _remark(mapped: RayMap, problem: Problem) -> Remark:
             "lost": mapped.lost,
             "lost_rows": problem.setup.links.row[sometimes].tolist(),
             "excluded": problem.objective.ceiling_db is None,
-            "half_space": bool(half_spaces) and not any(name.endswith(".thickness") for name in constants),
-            "half_spaces": half_spaces,
+            "half_space": bool(mapped.half_spaces)
+            and not any(name.endswith(".thickness") for name in constants),
+            "half_spaces": list(mapped.half_spaces),
             "names": list(constants),
             "values": list(constants.values()),
         },

@@ -8,7 +8,7 @@ axis (3GPP TR 38.901, eq. 7.3-4/5); the axis may be tilted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import epsilon_0, speed_of_light
 
 from calibray.engines.rays.export import Export
 from calibray.fields import (
@@ -202,20 +201,13 @@ class RayModel:
         materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])
 
-    def described(
-        self, candidate: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> Iterable[tuple[str, float]]:
-        """Names and values [k] of the assumed constants at a candidate [d]; a half-space has no thickness."""
-        half_spaces = self.half_spaces(candidate, values)
-        for (name, field), value in zip(self.assumed, np.exp(values).tolist(), strict=False):
-            if not (field == "thickness" and name in half_spaces):
-                yield f"{name}.{field}", value
-
-    def half_spaces(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> list[str]:
-        """Materials of assumed thickness without a reflection from the far face, at a candidate [d] with values [k]."""
-        materials = self.materials(candidate, values)
-        assumed = [name for name, field in self.assumed if field == "thickness"]
-        return [name for name in assumed if _is_half_space(materials[name], self.paths.frequency)]
+    def described(self, values: NDArray[np.float64], half_spaces: Sequence[str]) -> dict[str, float]:
+        """Names and values [k] of the assumed constants; the materials `half_spaces` have no thickness."""
+        return {
+            f"{name}.{field}": value
+            for (name, field), value in zip(self.assumed, np.exp(values).tolist(), strict=False)
+            if not (field == "thickness" and name in half_spaces)
+        }
 
     @cached_property
     def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -284,15 +276,6 @@ class Polarized:
             fields.append((tx, rx))
             first += group.size
         return with_antenna_fields(program, fields)
-
-
-def _is_half_space(material: Material, frequency: float) -> bool:
-    """Whether no wave returns from the far face of a slab at a frequency [Hz]."""
-    # ITU-R P.2040-3 eq. 9: eta'' = sigma / (2 pi f eps_0).
-    loss = material.conductivity / (2 * np.pi * frequency * epsilon_0)
-    root = np.sqrt(material.relative_permittivity - 1j * loss)
-    attenuation = -2 * np.pi * frequency / speed_of_light * root.imag * material.thickness
-    return material.thickness > HALF_SPACE / 2 or bool(attenuation > DECAYED)
 
 
 def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
