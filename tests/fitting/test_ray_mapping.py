@@ -109,6 +109,23 @@ def test_a_slab_is_found_among_its_resonances(foreign: Foreign) -> None:
     assert constants["ground.conductivity"] == pytest.approx(SLAB.conductivity, rel=0.05)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_division_by_zero_in_the_solver_is_not_announced(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SciPy divides by zero if the Jacobian is rank-deficient."""
+
+    def dividing(*arguments: object, **options: object) -> object:
+        assert np.isinf(np.divide(np.ones(1), np.zeros(1)))
+        return least_squares(*arguments, **options)
+
+    calls = two_calls(foreign, SLAB)
+    model = RayModel.of(foreign.problem.parameters, calls[-1].export.paths, known=False)
+    fit = ray_fit.Understanding(model, model.start, (False, False), np.inf)
+    monkeypatch.setattr(ray_fit, "least_squares", dividing)
+    assert np.isfinite(ray_fit.refined(fit, ray_fit.ratios_of(calls), calls[-1], 2).misfit_db)
+
+
 def test_a_thickness_that_changes_no_ratio_is_not_stated(foreign: Foreign) -> None:
     """The wave decays by 2.5 Np in the assumed slab, but a half-space explains the ratios at least as well."""
     calls = two_calls(foreign, Material(3.0, 0.2, HALF_SPACE))

@@ -342,10 +342,11 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
     weights = np.concatenate([ratio.weight for ratio in ratios])
     scale = ray_scan.ROBUST_DB * float(np.sqrt(weights.mean()))
     for loss in ("soft_l1", "linear"):  # the first loss gives less weight to paths near a resonance
-        values = least_squares(
-            lambda values: evaluate(values)[0], values, slopes, bounds=(lower, upper), x_scale="jac",
-            loss=loss, f_scale=scale, max_nfev=evaluations, xtol=1e-10, ftol=1e-8,
-        ).x  # fmt: skip
+        with np.errstate(divide="ignore"):  # SciPy divides by zero if the Jacobian is rank-deficient
+            values = least_squares(
+                lambda values: evaluate(values)[0], values, slopes, bounds=(lower, upper), x_scale="jac",
+                loss=loss, f_scale=scale, max_nfev=evaluations, xtol=1e-10, ftol=1e-8,
+            ).x  # fmt: skip
     misfit = float(np.linalg.norm(evaluate(values)[0]) / np.sqrt(weights.sum()))
     return replace(fit, values=np.clip(complete(values), *fit.model.bounds), misfit_db=misfit)
 
