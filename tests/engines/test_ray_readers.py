@@ -94,6 +94,23 @@ def test_antennas_of_orthogonal_polarization_receive_the_power_of_rounding_error
     np.testing.assert_allclose(path_loss(program), -10 * np.log10(power), atol=1e-4)
 
 
+def test_surfaces_that_coincide_have_the_material_that_sionna_hit() -> None:
+    """A wave is transmitted through the common wall of two buildings of different materials."""
+    scene = rt.load_scene(rt.scene.simple_street_canyon)
+    scene.frequency = FREQUENCY
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.add(rt.Transmitter("tx", [-30.0, 0.0, 10.0]))
+    for number, x in enumerate((-20.0, 0.0, 25.0, 40.0)):
+        scene.add(rt.Receiver(f"rx{number}", [x, 3.0 if x < 30 else -2.0, 1.5]))
+    scene.add(rt.Receiver("rx4", [-44.0, 30.0, 1.5]))
+    refracted = rt.PathSolver()(scene, max_depth=2, samples_per_src=20_000)
+    rows = read_sionna_paths(refracted)
+    with pytest.raises(InputError, match="coincide there; state the material"):
+        read(rows.frame.drop(columns="hit_material"))
+    assert read(refracted).num_paths > 20
+    assert {"concrete", "marble"} <= set(rows.frame.hit_material.dropna())
+
+
 def test_a_gain_of_sionna_that_is_not_a_number_is_refused(paths: rt.Paths) -> None:
     """Otherwise, the link would silently lose the path."""
     real, imaginary = (np.array(part) for part in paths.a)

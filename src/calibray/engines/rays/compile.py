@@ -147,8 +147,9 @@ def rays_of(paths: Paths) -> RayTable:
     material = np.full(shape, "", dtype=object)
     kind[present], vertex[present] = paths.kind, paths.vertex
     material[present] = np.array(list(paths.materials), dtype=object)[paths.material]
+    unstated = np.full(shape, "")
     return RayTable(
-        "paths", np.arange(count), link, tx, rx, vertex, kind, material.astype(np.str_), np.full(shape, ""), power,
+        "paths", np.arange(count), link, tx, rx, vertex, kind, material.astype(np.str_), unstated, unstated, power,
         delay,
     )  # fmt: skip
 
@@ -195,6 +196,9 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
         reflects=table.kind[present] == Kind.SPECULAR,
         diffracts=table.kind[present] == Kind.DIFFRACTION,
         material=_stated_materials(table, scene)[present],
+        preferred=np.array(
+            [names.index(name) if name in names else -1 for name in table.hit_material[present]], int
+        ),
         label=np.array(
             [f"{table.source}: path {table.path[p]}, point {s + 1}" for p, s in zip(row, step, strict=True)]
         ),

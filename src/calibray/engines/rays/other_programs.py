@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 from scipy.io.matlab import MatReadError
 
-from calibray.engines.rays.table import ENDS, LARGEST_ARRAYS, TYPES, columns_table, read_ray_file
+from calibray.engines.rays.table import (
+    ENDS,
+    HIT_MATERIAL,
+    LARGEST_ARRAYS,
+    TYPES,
+    columns_table,
+    read_ray_file,
+)
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.paths import Paths
@@ -29,12 +36,14 @@ class Polyline(NamedTuple):
         types: Types of the n - 2 interactions, as in the column `type`.
         power_db: Path gain [dB].
         delay: Propagation delay [s]; NaN if not stated.
+        materials: Names of the materials at the interactions, as in the column `hit_material`; empty if not stated.
     """
 
     points: NDArray[np.floating]
     types: Sequence[str]
     power_db: float
     delay: float = np.nan
+    materials: Sequence[str | None] = ()
 
 
 def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
@@ -67,6 +76,9 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
     frame = pd.DataFrame({name: np.repeat(values, count) for name, values in per_path.items()})
     frame["point"] = np.concatenate([np.arange(number) for number in count])
     frame["type"] = [name for path in paths for name in (ENDS[0], *path.types, ENDS[1])]
+    frame[HIT_MATERIAL] = [
+        name for path in paths for name in (None, *(path.materials or [None] * len(path.types)), None)
+    ]
     frame[["x", "y", "z"]] = np.concatenate([np.asarray(path.points, dtype=float) for path in paths])
     return SourceTable(frame.dropna(axis=1, how="all"), source=source)
 
@@ -473,13 +485,18 @@ def read_sionna_paths(paths: Any) -> SourceTable:
 
 
 def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
+    from calibray.tracing.sionna.live_scene import (
+        materials_of_shapes,
+    )  # takes seconds, and only these paths need it
+
     real, imaginary = (np.array(part, dtype=float) for part in paths.a)
     with np.errstate(divide="ignore"):
         level = 10 * np.log10((real**2 + imaginary**2).sum(axis=1).mean(axis=2))  # [R, T, P]
     shape = level.shape
     kinds, vertices = np.array(paths.interactions), np.array(paths.vertices, dtype=float)
+    objects = np.array(paths.objects)
     if not paths.synthetic_array:  # ports at one place have the same paths
-        kinds, vertices = kinds[:, :, 0, :, 0], vertices[:, :, 0, :, 0]
+        kinds, vertices, objects = (each[:, :, 0, :, 0] for each in (kinds, vertices, objects))
     delay = np.array(paths.tau, dtype=float)
     delay = delay if delay.shape == shape else delay[:, 0, :, 0]
     sources, targets = (
@@ -487,11 +504,13 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
         for ends, count in ((paths.sources, shape[1]), (paths.targets, shape[0]))
     )
     names = {int(kind): name for name, kind in TYPES.items()}
+    materials = materials_of_shapes(np.unique(objects[kinds > 0]).tolist())
     for rx, tx, path in np.argwhere(delay >= 0).tolist():
         kind = [int(code) for code in kinds[:, rx, tx, path] if code]
         inner = vertices[: len(kind), rx, tx, path]
         points = np.vstack([sources[tx], inner, targets[rx]])
-        yield Polyline(points, [names[code] for code in kind], level[rx, tx, path], delay[rx, tx, path])
+        hit = [materials.get(number) for number in objects[: len(kind), rx, tx, path].tolist()]
+        yield Polyline(points, [names[code] for code in kind], level[rx, tx, path], delay[rx, tx, path], hit)
 
 
 def _sionna_positions(ends: Any, count: int) -> NDArray[np.float64]:

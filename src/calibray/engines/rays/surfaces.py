@@ -99,6 +99,7 @@ class Hits:
         reflects: Whether the law of reflection must hold [n].
         diffracts: Whether an edge diffracts the wave; the edge's faces can have different materials [n].
         material: Index of the stated material; -1 if none is stated [n].
+        preferred: Index of the material that decides where surfaces coincide; -1 if none does [n].
         label: Names of the interactions in messages [n].
     """
 
@@ -109,6 +110,7 @@ class Hits:
     reflects: NDArray[np.bool_]
     diffracts: NDArray[np.bool_]
     material: NDArray[np.int64]
+    preferred: NDArray[np.int64]
     label: NDArray[np.str_]
 
     def mirror_error(self, index: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -137,7 +139,9 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     # A point displaced by the tolerance changes the directions of both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
     # For each point, faces that satisfy the law of reflection come first, in order of distance.
-    order = np.lexsort((distance, bent, index))
+    # Among coincident faces, those of the preferred material come first.
+    preferred = surfaces.material[face] == hits.preferred[index]
+    order = np.lexsort((distance - SAME * preferred, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
     matched, first = np.unique(index, return_index=True)
     if len(matched) < len(hits.point):
@@ -175,13 +179,14 @@ def _refuse_ambiguous(
     best = first[np.searchsorted(index[first], index)]
     material = surfaces.material[face]
     parallel = np.abs(np.sum(surfaces.normal[face] * surfaces.normal[face[best]], axis=1)) > 0.999
-    unstated = hits.material[index] < 0
+    unstated = (hits.material[index] < 0) & (hits.preferred[index] != material[best])
     rival = unstated & (material != material[best]) & (distance - distance[best] < SAME) & parallel & ~bent
     if rival.any():
         pair = int(np.argmax(rival))
         raise InputError(
             f"{hits.label[index[pair]]}: surfaces of {names[material[best[pair]]]!r} and {names[material[pair]]!r} "
-            "coincide there; state the material in the column material"
+            "coincide there; state the material in the column material of the table (for paths of Sionna RT: keep their "
+            "scene in memory until they are read)"
         )
 
 

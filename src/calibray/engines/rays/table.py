@@ -43,6 +43,9 @@ POWERS: Final = ("power_db", "gain_real", "gain_imag")
 OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
 """Optional columns of a table; unknown names are compared with these, because a misspelt name would be ignored."""
 
+HIT_MATERIAL: Final = "hit_material"
+"""Optional column like `material`, which decides only where surfaces of different materials coincide."""
+
 QUANTITIES: Final = {
     "gain_real": r"\b(re|real)\b",
     "gain_imag": r"\b(im|imag|imaginary)\b",
@@ -79,6 +82,7 @@ class RayTable:
         kind: Kinds of interaction, 0 beyond the last one [P, D].
         material: Names of materials, empty where not stated [P, D].
         object: Names of objects, empty where not stated [P, D].
+        hit_material: Names of materials that decide only where surfaces coincide, empty where not stated [P, D].
         power: Path gain [P], 0 for an absent path; None if not stated.
         delay: Propagation delay [P], [s]; None if not stated.
     """
@@ -92,6 +96,7 @@ class RayTable:
     kind: NDArray[np.int64]
     material: NDArray[np.str_]
     object: NDArray[np.str_]
+    hit_material: NDArray[np.str_]
     power: NDArray[np.float64] | None
     delay: NDArray[np.float64] | None
 
@@ -127,7 +132,7 @@ class RayTable:
 
         names = {
             name: padded(_optional_labels(table, name), np.full(shape, "", dtype=object)).astype(np.str_)
-            for name in ("material", "object")
+            for name in ("material", "object", HIT_MATERIAL)
         }
         return cls(
             source=table.source,
@@ -189,7 +194,7 @@ def _checked_rows(table: SourceTable) -> SourceTable:
 
 def _with_known_names(table: SourceTable) -> SourceTable:
     """The table with the documented names of its known columns; names that seem to be misspelt are refused."""
-    known = (*REQUIRED, *OPTIONAL)
+    known = (*REQUIRED, *OPTIONAL, HIT_MATERIAL)
     given = [str(name) for name in table.frame]
     names = [name if (name := _plain(text)) in known else text for text in given]
     absent = {*OPTIONAL} - {*names}

@@ -40,6 +40,12 @@ DIRECTIONS: Final = 64
 """Number of directions in which a pattern is compared with the known patterns."""
 
 
+def materials_of_shapes(numbers: Iterable[int]) -> dict[int, str]:
+    """Names of the materials of shapes, by their number in Mitsuba; shapes of a scene that was deleted are missing."""
+    shapes = {number: dr.reinterpret_array(mi.ShapePtr, mi.UInt32(number))[0] for number in numbers}
+    return {number: shape.bsdf().id() for number, shape in shapes.items() if shape is not None}
+
+
 @dataclass(frozen=True, eq=False)
 class LiveScene:
     """The content of a scene in memory.
