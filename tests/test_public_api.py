@@ -23,7 +23,7 @@ SIGNATURES = {
     "report": "result, file, figures, overwrite, progress",
     "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, workers, "
     "allow_changed_inputs",
-    "validate": "study, blocks, by, workers, progress, tracer",
+    "validate": "study, blocks, by, workers, progress, tracer, ledger",
     "suggest": "result, candidates, count, progress, allow_changed_inputs, observables",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
