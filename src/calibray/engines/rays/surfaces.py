@@ -185,8 +185,8 @@ def _refuse_ambiguous(
         pair = int(np.argmax(rival))
         raise InputError(
             f"{hits.label[index[pair]]}: surfaces of {names[material[best[pair]]]!r} and {names[material[pair]]!r} "
-            "coincide there; state the material in the column material of the table (for paths of Sionna RT: keep their "
-            "scene in memory until they are read)"
+            "coincide there; state the material in the column material of the table (paths of Sionna RT state it while "
+            "their scene is in memory)"
         )
 
 

@@ -1,7 +1,7 @@
 """Reads scenes loaded in plain Sionna RT, sets their materials, and verifies exported scenes."""
 
 # Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
-# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportIndexIssue=false
 
 from __future__ import annotations
 
