@@ -476,7 +476,7 @@ def test_a_height_model_without_a_usable_grid_is_refused(tmp_path, change, messa
         read_terrain(rewrite(height_model(tmp_path / "dem.tif"), **change), FRAME, (-10, -10, 10, 10))
 
 
-@pytest.mark.parametrize("gap", [-32768.0, -9999.0, 32767.0, -3.4e38])
+@pytest.mark.parametrize("gap", [-32768.0, -9999.0, -999.0, 9999.0, 32767.0, -3.4e38])
 def test_an_undeclared_gap_is_no_height(tmp_path, gap):
     file = height_model(tmp_path / "dem.tif", missing=True)
     with rasterio.open(file) as model:
@@ -488,6 +488,25 @@ def test_an_undeclared_gap_is_no_height(tmp_path, gap):
         InputError, match=r"12 of .* cells have values .* not heights on land, such as .*a_nodata"
     ):
         read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
+
+
+def test_cells_far_below_all_cells_around_them_cause_a_warning(tmp_path, caplog):
+    """The number -999 in feet, not declared as nodata, is -304 m, a height that occurs on land."""
+    file = height_model(tmp_path / "dem.tif", missing=True)
+    with rasterio.open(file) as model:
+        heights, profile = model.read(1), model.profile
+    feet = np.where(heights == -9999.0, -999.0, heights / 0.3048)
+    with rasterio.open(file, "w", **{**profile, "nodata": None}) as model:
+        model.write(feet, 1)
+        model.units = ("ft",)
+    read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
+    assert "12 of 576 cells have the height -304.5 m" in caplog.text
+    # Row 30 and column 40: 95 m to the north and 5 m to the east of the frame's origin, in UTM.
+    assert "longitude 11.57561, latitude 48.13825" in caplog.text
+    assert "-a_nodata -999)" in caplog.text
+    caplog.clear()
+    read_terrain(height_model(tmp_path / "dem.tif", missing=True), FRAME, (-100, -100, 100, 100))
+    assert caplog.text == ""
 
 
 @pytest.mark.parametrize(
@@ -559,6 +578,7 @@ def test_a_canopy_becomes_polygons_of_equal_height(tmp_path):
     heights = np.zeros((20, 20))
     heights[4:6, 10:15] = 12.4  # 50 m east of the origin, 40 to 60 m north of it
     heights[4, 15], heights[10, 2], heights[0, 0], heights[19, 19] = 7.0, 1.9, -1.0, 30.0
+    heights[8, 8], heights[8, 12] = -9999.0, -999.0  # no trees, although the file declares only -1 as nodata
     frame = Frame.utm(11.5755, 48.1374)
     outline, top = read_canopy(canopy(tmp_path / "c.tif", heights), frame, np.array([-60, -60, 99, 99]))
     assert sorted(top) == [7.0, 12.0]

@@ -42,9 +42,9 @@ LARGEST_BLOCK: Final = 2**28
 TEXT_GROWTH: Final = 15
 """Memory needed to parse GeoJSON or DXF, as a multiple of the file size [1]."""
 
-HEIGHTS: Final = (-1000.0, 10_000.0)
-"""Range of heights on land [m]; values outside this range, such as -32768, usually mark gaps that the file does not
-declare as such."""
+HEIGHTS: Final = (-500.0, 9000.0)
+"""Range of heights on land [m]; values outside this range, such as -999, usually mark gaps that the file does not
+declare as such. The shore of the Dead Sea is at about -440 m, and the top of Mount Everest at 8849 m."""
 
 _MAGIC: Final = (
     (b"SQLite format 3\0", "GPKG"),
@@ -231,11 +231,14 @@ class HeightModel:
     crs: str
     metres: float
 
-    def read(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> np.ma.MaskedArray:
+    def read(
+        self, first: NDArray[np.integer], last: NDArray[np.integer], lowest: float = HEIGHTS[0]
+    ) -> np.ma.MaskedArray:
         """Read heights [rows, columns], [m], from the first to the last row and column, inclusive; gaps are masked.
 
         Raises:
-            InputError: There are too many heights, they cannot be read, or a value is not a height on land.
+            InputError: There are too many heights, they cannot be read, or a value is less than `lowest` [m] or greater
+                than any height on land.
         """
         rasterio = library("rasterio", "scenes")
         rows, columns = (last - first + 1).tolist()
@@ -253,16 +256,19 @@ class HeightModel:
             ) from None
         heights = (stored * self.dataset.scales[0] + self.dataset.offsets[0]) * self.metres
         heights = np.ma.masked_invalid(heights)
-        low, high = HEIGHTS
-        wrong = (heights < low) | (heights > high)
+        wrong = (heights < lowest) | (heights > HEIGHTS[1])
         if np.ma.filled(wrong, False).any():
             value = stored[np.ma.filled(wrong, False)][0]
             raise InputError(
-                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values that are not "
-                f"heights on land, such as {value:g}; declare this as nodata (gdal_edit.py -a_nodata {value:g}), or "
-                "correct the unit"
+                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values below "
+                f"{HEIGHTS[0]:g} m or above {HEIGHTS[1]:g} m, which are not heights on land, such as {value:g}; "
+                f"declare this as nodata (gdal_edit.py -a_nodata {value:g}), or correct the unit"
             )
         return heights
+
+    def stored(self, height: float) -> float:
+        """The number that the file stores for a height [m]."""
+        return (height / self.metres - self.dataset.offsets[0]) / self.dataset.scales[0]
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -9,15 +10,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from calibray.coordinates import Frame, transformer
+from calibray.coordinates import WGS84, Frame, transformer
 from calibray.errors import InputError
-from calibray.scenes.authoring.geodata import open_height_model
+from calibray.scenes.authoring.geodata import HeightModel, open_height_model
 from calibray.scenes.meshes import Mesh
 
 MAX_POINTS: Final = 4_000_000
 """Largest number of points in a ground sheet; it limits memory use."""
+
+STEP: Final = 200.0
+"""Difference in height from all neighbouring cells above which a cell is suspicious [m]. The number -999 in feet, which
+marks gaps in some models, is a height of -304 m. The tallest buildings and masts in surface models are mostly lower."""
+
+_LOG: Final = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +119,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
         last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
         last = np.minimum(last, [dataset.height - 1, dataset.width - 1])
         crs, heights = model.crs, model.read(first, last)
+        _warn_of_steps(model, heights, first)
     filled, repairs = _fill(path, heights)
     if spacing is None:
         spacing = max(float(np.ptp(sample_x) / np.ptp(column)), 1.0)
@@ -143,6 +151,31 @@ def pixels(
     row = inverse.d * east + inverse.e * north + inverse.f
     # The affine transform is measured from the corner of the first cell, not from its centre.
     return column - 0.5, row - 0.5
+
+
+def _warn_of_steps(model: HeightModel, heights: np.ma.MaskedArray, first: NDArray[np.integer]) -> None:
+    """Warn if the lowest or highest cells [rows, columns], [m], differ from all their neighbours by `STEP` or more.
+
+    Such cells are often gaps that the file does not declare. `first` is the row and column of the first cell.
+    """
+    known = ~np.ma.getmaskarray(heights)
+    if not known.any():
+        return
+    for extreme in (heights.min(), heights.max()):
+        cells = known & (heights.data == extreme)
+        ring = np.asarray(binary_dilation(cells, np.ones((3, 3))), dtype=bool)
+        around = heights.data[ring & known & ~cells]
+        step = float(np.abs(around - extreme).min()) if len(around) else 0.0
+        if step >= STEP:
+            row, column = (first + np.argwhere(cells)[0]).tolist()
+            place = transformer(model.crs, WGS84).transform(*model.dataset.xy(row, column))
+            stored = model.stored(float(extreme))
+            _LOG.warning(
+                "height model %s: %d of %d cells have the height %.4g m, %.4g m or more from all cells around them; "
+                "the first is at longitude %.5f, latitude %.5f; if they are gaps, declare them as nodata "
+                "(gdal_edit.py -a_nodata %g)",
+                model.path, cells.sum(), cells.size, extreme, step, *place, stored,
+            )  # fmt: skip
 
 
 def _fill(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], dict[str, int]]:

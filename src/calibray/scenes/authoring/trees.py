@@ -178,7 +178,7 @@ def read_canopy(
 
     Args:
         path: A GeoTIFF of heights above the ground, with the same requirements and limits as a height model
-            (`open_height_model`); gaps have no trees.
+            (`open_height_model`); gaps and cells with negative values have no trees.
         frame: The scene's frame.
         bounds: West, south, east and north bounds in the frame [4], [m].
 
@@ -199,7 +199,9 @@ def read_canopy(
         size = np.array([dataset.height, dataset.width])
         first = np.clip(np.floor([row.min(), column.min()]).astype(int), 0, size - 1)
         last = np.clip(np.ceil([row.max(), column.max()]).astype(int), 0, size - 1)
-        heights, crs = model.read(first, last).filled(0.0), model.crs
+        # A negative value marks a cell without a tree, whatever its size.
+        heights = np.maximum(model.read(first, last, lowest=-np.inf).filled(0.0), 0.0)
+        crs = model.crs
     classes = np.round(heights / STEP).astype(np.int32)
     a, b, c, d, e, f = (float(value) for value in tuple(affine)[:6])
     row, column = (int(value) for value in first)
