@@ -97,6 +97,16 @@ def mounted(plain: Study, tx: dict[str, Any] = TX, **links: Any) -> Study:
     )
 
 
+def test_a_missing_column_of_the_antennas_is_named_with_its_key_and_both_tables(planted: Study) -> None:
+    study = mounted(planted, TX | {"azimuth_deg": "bearin"})
+    with pytest.raises(
+        InputError,
+        match=r"powers\.csv with \S+sites\.csv: no column 'bearin' \(links\.tx_antenna\.azimuth_deg\); "
+        "did you mean 'bearing'",
+    ):
+        study.measurements()
+
+
 def test_the_largest_gain_of_an_array_may_lie_in_a_side_lobe(tmp_path: Path) -> None:
     """Elements that look 40 degrees down, in four rows: the first side lobe, of opposite phase, is the strongest."""
     azimuth, elevation = (x.ravel() for x in np.meshgrid(np.arange(-180, 180, 5), np.arange(-90, 91, 5)))

@@ -220,7 +220,7 @@ def test_a_column_of_labels_is_missed_before_anything_is_traced(folder):
     for by, links in (("phone", 16), ("tx", 16), ("out_of_sight", 16)):
         opened = Setup.open(Study.from_content(content | {"holdout": {"by": by}}, folder / "study.toml"))
         assert len(opened.links) == links
-    with pytest.raises(InputError, match=r"log.csv: no column 'street'"):
+    with pytest.raises(InputError, match=r"log.csv with .*sites.csv: no column 'street'"):
         Setup.open(Study.from_content(content | {"holdout": {"by": "street"}}, folder / "study.toml"))
 
 

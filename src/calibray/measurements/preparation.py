@@ -142,6 +142,8 @@ class Preparation:
         flights: Columns of times of flight, in which certain numbers can represent missing values.
         computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
             been added. A function returns None if an optional column that it requires is missing.
+        check: Function that refuses a table without a required column, called after the columns of the transmitters
+            have been added.
         inside: Treatment of receivers inside buildings: "drop", "move", or None to keep their positions.
         outside: Function that moves positions out of buildings; required with `inside`.
     """
@@ -164,6 +166,7 @@ class Preparation:
     observables: Sequence[str] = ()
     flights: Sequence[str] = ()
     computed: Mapping[str, Compute] = field(default_factory=dict)
+    check: Callable[[SourceTable], None] | None = None
     inside: Literal["drop", "move"] | None = None
     outside: MoveOutside | None = None
 

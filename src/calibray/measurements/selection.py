@@ -21,7 +21,7 @@ from calibray.tables import rows_text
 def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
     """Select the rows that become links.
 
-    The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `computed`, `noise_floor_dbm` and
+    The steps `wide`, `track`, `where`, `missing`, `flights`, `transmitters`, `check`, `computed`, `noise_floor_dbm` and
     `censored` are applied in this order. A filter can therefore use the columns of the track, but not those of the
     transmitters. `value` is the column of the measured values; with `wide`, it is the name of the new column. Codes for
     missing values (`find_codes`) are treated as missing. With a noise floor, missing values and values below the floor
@@ -78,6 +78,8 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
             table = table.assign(**{name: table.frame[name].mask(coded)}).note(cause, int(coded.sum()))
     if steps.transmitters is not None:
         table = _join_transmitters(table, steps.transmitters, steps.transmitter)
+    if steps.check is not None:
+        steps.check(table)
     for name, compute in steps.computed.items():
         values = compute(table)
         table = table if values is None else table.assign(**{name: values})

@@ -49,6 +49,11 @@ class SourceTable:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def tables(self) -> str:
+        """The names of the table and of the tables from which it has columns, for messages."""
+        return " with ".join(dict.fromkeys([self.source, *(file for file, _, _ in self.joined.values())]))
+
     def assign(self, **columns: Any) -> SourceTable:
         """Return the same rows with columns [rows] added or replaced."""
         return replace(self, frame=self.frame.assign(**columns))
@@ -92,7 +97,7 @@ class SourceTable:
         """
         if name not in self.frame:
             raise InputError(
-                f"{self.source}: no column {shortened(name)!r}; {did_you_mean(name, map(str, self.frame))}"
+                f"{self.tables}: no column {shortened(name)!r}; {did_you_mean(name, map(str, self.frame))}"
             )
         return self.frame[name]
 

@@ -16,7 +16,7 @@ from calibray.paths import Paths
 from calibray.paths.chains import zenith_azimuth
 from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
-from calibray.support.messages import did_you_mean
+from calibray.support.messages import did_you_mean, shortened
 from calibray.tracing.antennas import EVERY, NEW, POSE, AntennaPattern, Mounting, Pose, stated_jones, turns
 from calibray.tracing.settings import Antenna
 
@@ -34,11 +34,26 @@ TR 38.901 are limited to 30 dB below the largest gain."""
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
     """The columns of the antennas and their directions, and of transmitter names if parameters refer to them."""
-    columns = [name for section in study.links.mountings.values() for name in section.columns]
+    columns = [name for section in study.links.mountings.values() for name in section.columns.values()]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
     ]
     return tuple(dict.fromkeys([*columns, *([study.links.transmitter] if own else [])]))
+
+
+def check_mounting_columns(study: StudyModel, table: SourceTable) -> None:
+    """Refuse a table that lacks a column of the antennas or their directions.
+
+    Raises:
+        InputError: A column is missing.
+    """
+    for end, section in study.links.mountings.items():
+        for key, name in section.columns.items():
+            if name not in table.frame:
+                raise InputError(
+                    f"{table.tables}: no column {shortened(name)!r} (links.{end}_antenna.{key}); "
+                    f"{did_you_mean(name, map(str, table.frame))}"
+                )
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:

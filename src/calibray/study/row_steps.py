@@ -27,7 +27,13 @@ from calibray.scenes.obstruction import CLUSTER
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.calibration_sections import HoldoutSection
 from calibray.study.model import StudyModel
-from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, states_port_power
+from calibray.study.mounting import (
+    PORT_POWER,
+    check_mounting_columns,
+    mounting_columns,
+    port_power,
+    states_port_power,
+)
 from calibray.study.regions import Place
 
 if TYPE_CHECKING:
@@ -92,6 +98,7 @@ def row_steps(study: StudyModel) -> Preparation:
         observables=[item.column for item in study.observables.values() if item.column is not None],
         flights=[item.column for item in study.observables.values() if item.column and item.kind in FLIGHTS],
         computed={PORT_POWER: partial(port_power, study)} if states_port_power(study) else {},
+        check=partial(check_mounting_columns, study),
         inside=inside,
         outside=None if inside is None else _move_outside(study),
     )

@@ -180,16 +180,10 @@ class MountingSection(Section):
         return self
 
     @property
-    def columns(self) -> tuple[str, ...]:
-        """The columns of the table of links that this section names."""
-        stated = (
-            self.type,
-            self.azimuth_deg,
-            self.downtilt_deg,
-            self.electrical_downtilt_deg,
-            self.steering_deg,
-        )
-        return tuple(name for name in stated if isinstance(name, str))
+    def columns(self) -> dict[str, str]:
+        """The columns of the table of links that this section names, by key."""
+        keys = ("type", "azimuth_deg", "downtilt_deg", "electrical_downtilt_deg", "steering_deg")
+        return {key: getattr(self, key) for key in keys if isinstance(getattr(self, key), str)}
 
 
 class LinksSection(Section):
