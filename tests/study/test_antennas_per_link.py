@@ -6,6 +6,7 @@ import hashlib
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable
 from calibray.prediction.coverage_map import _column_values
+from calibray.prediction.predict import as_links
 from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import remark_text
@@ -105,6 +107,20 @@ def test_a_missing_column_of_the_antennas_is_named_with_its_key_and_both_tables(
         "did you mean 'bearing'",
     ):
         study.measurements()
+
+
+def test_a_table_to_predict_without_the_columns_of_the_antennas_is_refused_before_tracing(
+    planted: Study,
+) -> None:
+    """Positions in metres are not joined with the table of transmitters, which has these columns."""
+    result = SimpleNamespace(study=mounted(planted, transmitter="transmitter"))
+    table = pd.DataFrame([[0.0, 0.0, 10.0, 50.0, 0.0, 1.5]], columns=COLUMNS)
+    with pytest.raises(
+        InputError,
+        match=r"links: no column 'antenna' \(links\.tx_antenna\.type\); add it to the columns tx_x, .* rx_z, or leave "
+        r"out tx_x, tx_y and tx_z and give transmitter, rx_x, rx_y, rx_z as in the study's table, so .*sites\.csv",
+    ):
+        as_links(result, table)
 
 
 def test_the_largest_gain_of_an_array_may_lie_in_a_side_lobe(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup
 from calibray.study.calibration_sections import OFFSET
 from calibray.study.link_checks import refuse_far_receivers
+from calibray.study.mounting import check_mounting_columns
 from calibray.support.messages import type_name
 from calibray.support.progress import Progress
 from calibray.tables import hertz
@@ -109,7 +110,8 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
     """New links from a table or from rows of a file, with the groups and carriers in the columns that the study names.
 
     Raises:
-        InputError: The links are not a table, a column is missing, or a position is not finite.
+        InputError: The links are not a table, a column of the groups, carriers or antennas is missing, or a position is
+            not finite.
     """
     if isinstance(links, Measurements):
         return links
@@ -123,7 +125,9 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
             f"links: is a {type_name(links)}, must be a pandas DataFrame, such as pandas.read_csv(file) for a file, or "
             "table.to_pandas() for a table of another package"
         )
-    return _with_measured_spellings(result.prediction.model, result.study.places(links))
+    placed = result.study.places(links)
+    check_mounting_columns(result.study, placed.table)
+    return _with_measured_spellings(result.prediction.model, placed)
 
 
 def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:

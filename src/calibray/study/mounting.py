@@ -49,11 +49,19 @@ def check_mounting_columns(study: StudyModel, table: SourceTable) -> None:
     """
     for end, section in study.links.mountings.items():
         for key, name in section.columns.items():
-            if name not in table.frame:
-                raise InputError(
-                    f"{table.tables}: no column {shortened(name)!r} (links.{end}_antenna.{key}); "
-                    f"{did_you_mean(name, map(str, table.frame))}"
+            if name in table.frame:
+                continue
+            remedy = did_you_mean(name, map(str, table.frame))
+            if end == "tx" and study.transmitters_path is not None and not table.joined:
+                own = [name for name in (study.links.transmitter, *study.links.rx) if isinstance(name, str)]
+                remedy = (
+                    f"add it to the columns {shortened(', '.join(map(str, table.frame)), 200)}, or leave out tx_x, "
+                    f"tx_y and tx_z and give {', '.join(own)} as in the study's table, so that the antennas come from "
+                    f"{study.transmitters_path}"
                 )
+            raise InputError(
+                f"{table.tables}: no column {shortened(name)!r} (links.{end}_antenna.{key}); {remedy}"
+            )
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
