@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -143,6 +144,17 @@ def test_the_rival_with_further_nuisances_is_not_called_an_offset_alone():
         "initial materials, offset only",
         "initial materials, nuisances only",
     ]
+
+
+def test_antennas_below_the_ground_have_their_own_line():
+    """If they are most antennas, the scene is still no indoor scene."""
+    below = shown.ROWS > 2
+    enclosed = EnclosedAntennas.of(shown.ROWS, below, ~below, below)
+    text = render(trace.overview(shown.paths(), shown.ROWS, enclosed))
+    assert re.search(
+        r"transmitter inside a building +0\ntransmitter below the ground +29 +rows 3, .*heights", text
+    )
+    assert re.search(r"receiver inside a building +1 +row 2: check the positions", text)
 
 
 def test_a_trace_and_its_check_are_printed_as_stored():

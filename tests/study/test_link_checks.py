@@ -196,6 +196,19 @@ def test_the_gain_of_an_array_is_no_mistake(town):
     assert named in suspicions(town, best.assign(loss=best.loss - 10), antenna=array)
 
 
+def test_transmitters_below_the_ground_are_named_with_their_table(town):
+    """Sectors at one position count separately, and the height is in the table of transmitters."""
+    frame = links().assign(transmitter=[f"S{1 + k % 3}" for k in range(60)])
+    x, y, z = MAST.tolist()
+    table = pd.DataFrame({"transmitter": ["S1", "S2", "S3"], "tx": x, "ty": y, "h": [-3.0, -3.0, z]})
+    table.to_csv(town / "sites.csv", index=False)
+    section = {"transmitters": "sites.csv", "tx": ["tx", "ty", "h"]}
+    path = town / "sites.csv"
+    assert f"2 of 3 transmitters (S1, S2 of {path}) are below the ground" in suspicions(
+        town, frame, links=section
+    )
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 import calibray as cb
@@ -43,3 +44,15 @@ def test_a_setup_opens_the_tracer_it_is_given(study: Study) -> None:
     assert setup.study is study
     assert list(setup.scene.materials) == ["ground"]
     assert len(setup.links) == 30
+
+
+def test_an_antenna_below_the_ground_is_not_inside_a_building(study: Study) -> None:
+    from calibray.study import Setup
+
+    file = study.path.parent / "links.csv"
+    table = pd.read_csv(file)
+    table.loc[[1, 4], "tx_z"] = -2.0
+    table.to_csv(file, index=False)
+    enclosed = Setup.open(study, tracer=TwoRay).enclosed
+    assert enclosed is not None
+    assert (enclosed.tx, enclosed.tx_below, enclosed.rx_below) == ((), (3, 6), ())

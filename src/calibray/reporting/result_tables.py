@@ -88,12 +88,17 @@ def suspicious_rows(
     yield "without a path", str(len(without_path)), text + treatment if text else ""
     if enclosed is None:
         return
-    for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
+    for end, rows, below in (
+        ("transmitter", enclosed.tx, enclosed.tx_below),
+        ("receiver", enclosed.rx, enclosed.rx_below),
+    ):
         if enclosed.indoors:
             remedy = "like most receivers: the scene is assumed to be indoors"
         else:
             remedy = f"{rows_text(rows)}: check the positions"
         yield f"{end} inside a building", str(len(rows)), remedy if rows else ""
+        if below:
+            yield f"{end} below the ground", str(len(below)), f"{rows_text(below)}: check the heights"
 
 
 def parameters(result: Record) -> Table:

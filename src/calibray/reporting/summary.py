@@ -196,11 +196,18 @@ def _cautions(result: Record) -> Iterator[Sentence]:
         verb, count = "has" if len(without_path) == 1 else "have", counted(len(result.links), "link")
         sentences.append(f"{len(without_path):,} of {count} {verb} no path ({rows_text(without_path)}).")
     enclosed = result.provenance.enclosed
-    if enclosed is not None and not enclosed.indoors:
-        for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
-            if rows:
+    if enclosed is not None:
+        for end, rows, below in (
+            ("transmitter", enclosed.tx, enclosed.tx_below),
+            ("receiver", enclosed.rx, enclosed.rx_below),
+        ):
+            if rows and not enclosed.indoors:
                 sentences.append(
                     f"The {end} is inside a building in {rows_text(list(rows))}: check the positions."
+                )
+            if below:
+                sentences.append(
+                    f"The {end} is below the ground in {rows_text(list(below))}: check the heights."
                 )
     sentences += [
         remark_text(remark) for remark in result.uncertainty.remarks if remark.kind == RemarkKind.RETRACED

@@ -215,7 +215,7 @@ class Provenance:
     Attributes:
         files: SHA-256 of every file of the scene and the antennas, by path; empty if unknown.
         rows: Numbers of rows that were left out, averaged or moved when links were made from them, by cause.
-        enclosed: Antennas inside closed bodies of the scene; None if this was not checked.
+        enclosed: Antennas inside closed bodies of the scene or below the ground; None if this was not checked.
     """
 
     files: dict[str, Digest] = field(default_factory=dict)
@@ -334,8 +334,8 @@ class Record:
             "calibrated_on": int((~held_out & usable).sum()),
             "held_out": int((held_out & usable).sum()),
             "rows_without_path": self.links["row"][~has_path].tolist(),
-            "rows_with_enclosed_tx": None if enclosed is None else list(enclosed.tx),
-            "rows_with_enclosed_rx": None if enclosed is None else list(enclosed.rx),
+            "rows_with_enclosed_tx": None if enclosed is None else sorted(enclosed.tx + enclosed.tx_below),
+            "rows_with_enclosed_rx": None if enclosed is None else sorted(enclosed.rx + enclosed.rx_below),
         }
 
 

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from typing import Final
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
@@ -103,7 +104,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     scale = scale_findings(overhead.bounds[:3], overhead.bounds[3:])
     checks = (
         *((finding.problem, finding.remedy) for finding in scale if finding.severity == "error"),
-        *_positions(overhead, links, study.links.position == "geographic", study.trace.refraction),
+        *_positions(study, overhead, links),
         *_far_transmitters(study, links, overhead.bounds),
         *_units(study),
         *_levels(study, links, overhead),
@@ -188,32 +189,51 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
         )
 
 
-def _positions(
-    overhead: SceneSurfaces, links: Measurements, is_geographic: bool, through_walls: bool
-) -> Iterator[tuple[str, str]]:
-    tx, rx = np.unique(links.tx, axis=0), np.unique(links.rx, axis=0)
-    refuse_far_receivers(overhead.bounds, rx, links.source, is_geographic)
-    for name, points in (("receivers", rx), ("transmitters", tx)):
+def _transmitters(
+    study: StudyModel, links: Measurements
+) -> tuple[NDArray[np.float64], Callable[[NDArray[np.bool_]], str]]:
+    """Positions of the transmitters [n, 3], [m], and a function that counts and names those in a mask [n].
+
+    Transmitters with different names count separately, also at one position, such as the sectors of a mast.
+    """
+    column, frame = study.links.transmitter, pd.DataFrame(links.tx)
+    named = column in links.frame
+    frame = frame.assign(name=links.frame[column].astype(str).to_numpy() if named else "").drop_duplicates()
+    names, table = frame.pop("name").to_numpy(), study.transmitters_path
+
+    def counted(mask: NDArray[np.bool_]) -> str:
+        source = "" if table is None else f" of {table}"
+        listed = f" ({shortened(', '.join(dict.fromkeys(names[mask])))}{source})" if named else ""
+        return f"{int(mask.sum())} of {len(mask)} transmitters{listed}"
+
+    return frame.to_numpy(), counted
+
+
+def _positions(study: StudyModel, overhead: SceneSurfaces, links: Measurements) -> Iterator[tuple[str, str]]:
+    rx, (tx, counted_tx) = np.unique(links.rx, axis=0), _transmitters(study, links)
+    refuse_far_receivers(overhead.bounds, rx, links.source, study.links.position == "geographic")
+
+    def counted_rx(mask: NDArray[np.bool_]) -> str:
+        return f"{int(mask.sum())} of {len(mask)} receivers"
+
+    for counted, points in ((counted_rx, rx), (counted_tx, tx)):
         below = overhead.underground(points) | (points[:, 2] < overhead.bounds[2])
         if below.any():
-            problem = f"{int(below.sum())} of {len(points)} {name} are below the ground"
-            yield problem, "check heights and their datum"
+            yield f"{counted(below)} are below the ground", "check heights and their datum"
         high = points[:, 2] > overhead.bounds[5] + HIGH
         if high.any():
-            problem = (
-                f"{int(high.sum())} of {len(points)} {name} are more than {HIGH:g} m above the whole scene"
-            )
             yield (
-                problem,
+                f"{counted(high)} are more than {HIGH:g} m above the whole scene",
                 "check heights and their datum: links.heights = 'ground' measures them from the ground",
             )
         touching = overhead.touching(points)
         if touching.any():
             yield (
-                f"{int(touching.sum())} of {len(points)} {name} touch the ground, a floor or a roof; the reflections "
-                "from this surface are missed",
+                f"{counted(touching)} touch the ground, a floor or a roof; the reflections from this surface are "
+                "missed",
                 "give the height of the antenna, at least 1 cm above the surface",
             )
+    through_walls = study.trace.refraction
     roofed = overhead.under_roof(rx)
     if roofed.mean() > 0.8 and (through_walls or overhead.under_roof(tx).any()):
         return  # an indoor scene, or indoor receivers with outdoor transmitters
@@ -246,11 +266,11 @@ def _positions(
         return  # antennas may be indoors
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
-        problem = f"{int(inside.sum())} of {len(rx)} receivers are inside buildings"
+        problem = f"{counted_rx(inside)} are inside buildings"
         yield problem, "correct or remove these receivers, or set links.inside = 'move'"
     inside = overhead.under_roof(tx) & ~overhead.underground(tx)
     if inside.any():
-        problem = f"{int(inside.sum())} of {len(tx)} transmitters are inside buildings"
+        problem = f"{counted_tx(inside)} are inside buildings"
         yield problem, "check position and height: an antenna on a roof must be above the roof"
 
 

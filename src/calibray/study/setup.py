@@ -20,7 +20,8 @@ from calibray.materials import Material
 from calibray.measurements import Ground, Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
-from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.scenes import Scene, check_material_name, read_scene, read_triangles
+from calibray.scenes.checks.positions import UNDER, locate
 from calibray.scenes.obstruction import Region, with_obstruction
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.displacement import (
@@ -308,11 +309,16 @@ class Setup:
 
     @cached_property
     def enclosed(self) -> EnclosedAntennas | None:
-        """Antennas inside closed bodies of the scene; None if an external program computes path loss."""
+        """Antennas inside closed bodies or below the ground; None if an external program computes path loss."""
         if self.study.engine.external:
             return None
-        tracer, links = self.tracer, self.links
-        return EnclosedAntennas.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
+        ends = (self.links.tx, self.links.rx)
+        enclosed = [self.tracer.enclosed(points) for points in ends]
+        if not np.any(enclosed):
+            return EnclosedAntennas.of(self.links.row, *enclosed)
+        triangles = read_triangles(self.scene)
+        below = [locate(triangles, points) == UNDER for points in ends]
+        return EnclosedAntennas.of(self.links.row, *enclosed, *below)
 
     @cached_property
     def files(self) -> dict[str, str]:

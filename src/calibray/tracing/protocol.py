@@ -225,21 +225,37 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 @dataclass(frozen=True)
 class EnclosedAntennas:
-    """Antennas inside closed bodies of the scene, usually because of wrong positions.
+    """Antennas inside closed bodies of the scene or below the ground, usually because of wrong positions.
 
     Attributes:
-        tx: Rows of the source file whose transmitter is enclosed.
-        rx: Rows of the source file whose receiver is enclosed.
-        indoors: Whether most links have an enclosed antenna, as in an indoor scene; enclosed antennas are then not
+        tx: Rows of the source file whose transmitter is inside a body.
+        rx: Rows of the source file whose receiver is inside a body.
+        indoors: Whether most links have an antenna inside a body, as in an indoor scene; these antennas are then not
             suspicious.
+        tx_below: Rows of the source file whose transmitter is below the ground.
+        rx_below: Rows of the source file whose receiver is below the ground.
     """
 
     tx: tuple[int, ...] = ()
     rx: tuple[int, ...] = ()
     indoors: bool = False
+    tx_below: tuple[int, ...] = ()
+    rx_below: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> EnclosedAntennas:
-        """Collect the rows of the source file, from the row of each link and the masks of enclosed antennas [L]."""
-        indoors = bool(np.mean(tx | rx) > 0.5)
-        return cls(tuple(row[tx].tolist()), tuple(row[rx].tolist()), indoors)
+    def of(
+        cls,
+        row: NDArray[np.integer],
+        tx: NDArray[np.bool_],
+        rx: NDArray[np.bool_],
+        tx_below: NDArray[np.bool_] | None = None,
+        rx_below: NDArray[np.bool_] | None = None,
+    ) -> EnclosedAntennas:
+        """Collect the rows of the source file, from the row of each link and the masks of enclosed antennas [L].
+
+        Of the enclosed antennas, those in the masks of antennas below the ground [L] are not inside a body.
+        """
+        under = [np.zeros(len(row), dtype=bool) if mask is None else mask for mask in (tx_below, rx_below)]
+        tx, rx = tx & ~under[0], rx & ~under[1]
+        rows = [tuple(row[mask].tolist()) for mask in (tx, rx, *under)]
+        return cls(rows[0], rows[1], bool(np.mean(tx | rx) > 0.5), rows[2], rows[3])
