@@ -206,13 +206,18 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     ("change", "message"),
     [
         ({"height": "height"}, "no column 'height'"),
-        ({"height": "word"}, "contains 'high', must contain metres"),
+        ({"height": "word"}, "polygon 1: word = 'high', must be a length in metres; correct it, or leave"),
+        (
+            {"height": None, "columns": FootprintColumns(levels="storeys")},
+            "polygon 2: storeys = '4;5', must be a number of storeys; correct it, or leave it empty",
+        ),
         ({"height": "negative"}, "polygon 2: negative = -1, must be finite, not negative and at most 1000"),
         ({"layer": "roads"}, "cannot be read"),
     ],
 )
 def test_wrong_columns_and_layers_are_refused(tmp_path, change, message):
-    path = layer(tmp_path / "t.gpkg", [1.0, 2.0, 3.0], "GPKG", word=["high"] * 3, negative=[1.0, -1.0, 2.0])
+    fields = {"word": ["high"] * 3, "negative": [1.0, -1.0, 2.0], "storeys": ["4", "4;5", None]}
+    path = layer(tmp_path / "t.gpkg", [1.0, 2.0, 3.0], "GPKG", **fields)
     with pytest.raises(InputError, match=message):
         read_footprints(path, **{"height": "hoehe", **change})
 

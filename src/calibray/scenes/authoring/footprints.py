@@ -348,7 +348,9 @@ def read_footprints(
     bottoms = _numbers(path, table, named.bottom, count)
     tops = np.full(count, np.nan) if height is None else _numbers(path, table, height, count)
     bottoms = np.where(np.isfinite(bottoms), bottoms, 0.0)
-    storeys = np.full(count, np.nan) if named.levels is None else _numbers(path, table, named.levels, count)
+    storeys = np.full(count, np.nan)
+    if named.levels is not None:
+        storeys = _numbers(path, table, named.levels, count, "a number of storeys")
     has_height = np.isfinite(tops) & (tops > bottoms)
     has_levels = ~has_height & (storeys * rule.storey > bottoms)
     labels = [None] * count if named.name is None else _column(path, table, named.name)
@@ -411,7 +413,11 @@ def _is_number(text: str) -> bool:
 
 
 def _numbers(
-    path: Path, columns: dict[str, NDArray[Any]], source: str | float, count: int
+    path: Path,
+    columns: dict[str, NDArray[Any]],
+    source: str | float,
+    count: int,
+    quantity: str = "a length in metres",
 ) -> NDArray[np.float64]:
     """Read numbers [count] from a column, or repeat a constant; NaN where the column has no value.
 
@@ -429,11 +435,12 @@ def _numbers(
     unit = find_length_unit([source]) if isinstance(source, str) else 1.0
     if values.dtype == object:
         lengths = [parse_length(None if value is None else str(value)) for value in values]
-        unread = [value for value, length in zip(values, lengths, strict=True) if value and length is None]
-        if unread:
-            raise InputError(
-                f"footprints {path}: column {source!r} contains {unread[0]!r}, must contain metres"
-            )
+        for number, (value, length) in enumerate(zip(values, lengths, strict=True), start=1):
+            if value and length is None:
+                raise InputError(
+                    f"footprints {path}, polygon {number}: {source} = {shortened(repr(value))}, must be {quantity}; "
+                    "correct it, or leave it empty"
+                )
         stated = [1.0 if value is None or not _is_number(str(value)) else unit for value in values]
         values, unit = np.array([np.nan if length is None else length for length in lengths]) * stated, 1.0
     numbers = np.asarray(values, dtype=float) * unit
