@@ -212,7 +212,7 @@ def test_footprints_of_geojson_are_projected(tmp_path):
             "polygon 2: storeys = '4;5', must be a number of storeys; correct it, or leave it empty",
         ),
         ({"height": "negative"}, "polygon 2: negative = -1, must be finite, not negative and at most 1000"),
-        ({"layer": "roads"}, "cannot be read"),
+        ({"layer": "roads"}, r"^\S+t\.gpkg: no layer 'roads'; use one of: t$"),
     ],
 )
 def test_wrong_columns_and_layers_are_refused(tmp_path, change, message):

@@ -24,7 +24,7 @@ from calibray.coordinates import WGS84, parse_crs
 from calibray.errors import InputError
 from calibray.support.lazy_imports import library
 from calibray.support.memory import available_memory
-from calibray.support.messages import first_line, shortened
+from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.support.output_files import exists
 
 RASTER_DRIVER: Final = "GTiff"
@@ -147,8 +147,10 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
     # DXF blocks can be nested, and nested blocks can expand from a few kilobytes to gigabytes.
     pyogrio.set_gdal_config_options({"DXF_INLINE_BLOCKS": False})
     try:
+        layers = pyogrio.list_layers(file)[:, 0].tolist()
+        if layer is not None and layer not in layers:
+            raise InputError(f"{path}: no layer {shortened(layer)!r}; {did_you_mean(layer, layers)}")
         if layer is None:
-            layers = pyogrio.list_layers(file)[:, 0].tolist()
             layer = "entities" if driver == "DXF" else layers[0]
             if len(layers) > 1 and driver != "DXF":
                 _LOG.warning("%s has the layers %s; %r is read", path, shortened(", ".join(layers)), layer)
@@ -163,6 +165,8 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
             )
         meta, _, geometry, fields = pyogrio.raw.read(file, layer=layer)
         outline = shapely.from_wkb(geometry)
+    except InputError:
+        raise  # it is a ValueError
     except (
         pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.FeatureError,
         pyogrio.errors.GeometryError, shapely.GEOSException, ValueError, IndexError,
