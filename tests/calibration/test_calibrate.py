@@ -434,6 +434,8 @@ def test_a_group_without_a_path_is_named_and_only_held_out_links_are_judged(tmp_
     assert sorted(result.nuisance.offsets_db) == ["east", "west"]
     assert result.nuisance.groups_without_path == ("cellar",)
     assert re.search(r"^cellar +no link with a path$", render(nuisances(result)), re.MULTILINE)
+    faint = replace(result, links=result.links.assign(faint=False))
+    assert "no link with a path and a power well above the noise floor" in render(nuisances(faint))
     assert result.content()["nuisance"]["groups_without_path"] == ["cellar"]
 
     held = planted.study(

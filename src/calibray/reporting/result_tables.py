@@ -9,7 +9,7 @@ from statistics import stdev
 from typing import Final
 
 from calibray.parameters.parameter import PARAMETER_BOUNDS
-from calibray.reporting.wording import diagnostics_table, group_text
+from calibray.reporting.wording import diagnostics_table, group_text, usable_link_text
 from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
@@ -168,7 +168,10 @@ def nuisances(result: Record) -> Table:
         (group_text(result, group) if group else "all links", f"{value:+z.2f}", spread(OFFSET, group))
         for group, value in nuisance.offsets_db.items()
     ]
-    rows += [(group_text(result, group), "no link with a path", "") for group in nuisance.groups_without_path]
+    rows += [
+        (group_text(result, group), f"no link with {usable_link_text(result)}", "")
+        for group in nuisance.groups_without_path
+    ]
     for name, values in others.items():
         rows += [
             (f"{name}, {group}" if group else name, f"{value:+.3g}", spread(name, group))

@@ -14,6 +14,7 @@ from calibray.reporting.wording import (
     method_text,
     prediction_text,
     scene_alone_text,
+    usable_link_text,
 )
 from calibray.result.record import Record
 from calibray.result.verdict import RemarkKind, Verdict
@@ -214,7 +215,9 @@ def _cautions(result: Record) -> Iterator[Sentence]:
     ]
     if result.nuisance.groups_without_path:
         groups = named(group_text(result, group) for group in result.nuisance.groups_without_path)
-        sentences.append(f"No calibration link of {groups} has a path, so its offset is unknown.")
+        sentences.append(
+            f"No calibration link of {groups} has {usable_link_text(result)}, so its offset is unknown."
+        )
     yield from _headed("What calls for caution?", sentences, "caution")
 
 

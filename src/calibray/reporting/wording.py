@@ -78,6 +78,11 @@ def group_text(record: Record, label: str) -> str:
         return label
 
 
+def usable_link_text(record: Record) -> str:
+    """What a link needs to determine the offset of its group."""
+    return "a path" + (" and a power well above the noise floor" if "faint" in record.links else "")
+
+
 def scene_alone_text(record: Record) -> str:
     """The difference between the exported scene alone and the predictions.
 
