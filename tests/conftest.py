@@ -24,10 +24,11 @@ import pytest
 from hypothesis import settings
 
 from calibray.cli import console
+from calibray.engines.replay import BATCH
 from calibray.fields import program as programs
 from calibray.fitting import search
 from calibray.support import cache_folder as caching
-from calibray.uncertainty import richer_paths
+from calibray.uncertainty import buildings, richer_paths
 from calibray.uncertainty import sequential_monte_carlo as sampler
 
 # Every run draws the same examples, and a busy machine fails no test.
@@ -80,7 +81,7 @@ def _no_lines_of_progress():
 FEW_CANDIDATES = {
     "fields", "prediction", "study", "tracing",
     "test_carriers", "test_chunks", "test_dask", "test_local_workers", "test_notebooks", "test_observable", "test_pose",
-    "test_program_with_rays", "test_ray_mapping", "test_rays", "test_shared_out",
+    "test_program_with_rays", "test_ray_mapping", "test_rays", "test_repeats", "test_richer_paths", "test_shared_out",
     "test_unreached_links",
 }  # fmt: skip
 """Rooms and files whose tests evaluate few candidates, so that compiling takes most of their time."""
@@ -88,12 +89,16 @@ FEW_CANDIDATES = {
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled_fast(request: pytest.FixtureRequest) -> Iterator[None]:
-    """XLA optimizes nothing if few candidates are evaluated, nor does it in processes that these tests start."""
+    """XLA optimizes nothing if few candidates are evaluated, nor does it in processes that these tests start.
+
+    Posterior draws are evaluated in batches of a search's size, which need no program of their own.
+    """
     if not {request.path.parent.name, request.path.stem} & FEW_CANDIDATES:
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(programs, "SMALL", sys.maxsize)
+        patch.setattr(buildings, "BATCHES", (1, BATCH))
         patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
         jax.config.update("jax_disable_most_optimizations", True)
         yield

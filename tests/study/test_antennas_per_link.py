@@ -161,7 +161,7 @@ def test_three_transmitters_with_their_own_antennas_and_powers_are_calibrated(pl
     assert len(table) == 36
 
 
-@pytest.mark.parametrize(("turned", "engine"), [(0.0, {}), (12.0, {}), (12.0, {"chunk_links": 10})])
+@pytest.mark.parametrize(("turned", "engine"), [(0.0, {}), (12.0, {}), (12.0, {"chunk_links": 12})])
 def test_a_sector_that_points_elsewhere_than_stated_is_named(
     planted: Study, turned: float, engine: dict[str, int]
 ) -> None:

@@ -92,13 +92,10 @@ def test_a_planted_attenuation_is_found_and_used_for_predictions(tmp_path, engin
     assert [*corners.min(axis=0), *corners.max(axis=0)] == pytest.approx(
         [*box.min(axis=0), *box.max(axis=0)], abs=0.051
     )
-    fixed = planted.study(
-        tmp_path,
-        table,
-        regions=REGIONS,
-        parameters={key: PARAMETERS[key] for key in PARAMETERS if key != TREES},
-    )
-    assert calibrate(fixed).rmse_db > result.rmse_db + 0.3
+    # With the attenuation that the study states, no permittivity comes close.
+    stated = np.column_stack([np.linspace(*planted.BOUNDS, 100), np.full(100, 0.3)])
+    error = engine.path_loss(stated) - table["path_loss_db"].to_numpy()
+    assert np.sqrt(np.mean(error**2, axis=1)).min() > result.rmse_db + 0.3
 
 
 @pytest.mark.parametrize(("column", "height"), [("h", 8.0), ("height_ft", 8.0 / 0.3048)])

@@ -95,6 +95,7 @@ def test_measurements_decide_whether_paths_are_missing(calibrated: tuple[bool, R
         assert values["outside"] == ([] if interval.contains(result.parameters[STONE]) else [STONE])
 
 
+@pytest.mark.parametrize("calibrated", [True], indirect=True)
 def test_a_stated_noise_model_or_no_further_traces_rule_the_check_out(
     calibrated: tuple[bool, Result, list[str]], tmp_path: Path
 ) -> None:

@@ -319,6 +319,8 @@ def _dot(a: object, b: object) -> jax.Array:
 
 
 _decibel = jax.jit(decibel)
+# Traced once for all sizes of a batch.
+_path_loss = jax.jit(program_path_loss, inline=True)
 _material_response = jax.jit(material_response)
 # The functions that `path_powers` calls have no compiler options: a user may compile them as part of another function.
 _split_by_step = jax.jit(split_by_step)
@@ -386,7 +388,7 @@ def _losses(
         changed = program
         if effects is not None:
             changed = apply_effects(program, effects.effects, effects.values[index])
-        return losses.at[index].set(program_path_loss(changed, tables[index], combining).astype(losses.dtype))
+        return losses.at[index].set(_path_loss(changed, tables[index], combining).astype(losses.dtype))
 
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
