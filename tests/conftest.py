@@ -82,7 +82,7 @@ FEW_CANDIDATES = {
     "fields", "prediction", "study", "tracing",
     "test_carriers", "test_chunks", "test_dask", "test_local_workers", "test_notebooks", "test_observable", "test_pose",
     "test_program_with_rays", "test_ray_mapping", "test_rays", "test_repeats", "test_richer_paths", "test_shared_out",
-    "test_unreached_links",
+    "test_unreached_links", "test_walk",
 }  # fmt: skip
 """Rooms and files whose tests evaluate few candidates, so that compiling takes most of their time."""
 

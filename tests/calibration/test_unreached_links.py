@@ -54,7 +54,7 @@ def calibrated(
     return cb.calibrate(cb.Study.from_content(study, folder / "study.toml"))
 
 
-@pytest.mark.parametrize("engine", [{}, {"chunk_links": 6}])
+@pytest.mark.parametrize("engine", [{}, {"chunk_links": 7}])
 def test_many_links_without_a_path_are_reported_with_the_switch_that_reaches_them(
     tmp_path: Path, engine: dict[str, int]
 ) -> None:

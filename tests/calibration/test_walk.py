@@ -33,7 +33,7 @@ def test_scene_init_run(tmp_path, monkeypatch):
     truth = json.loads((TOWN / "truth.json").read_text())
     log = pd.read_csv(TOWN / "rsrp.csv")
     stop = log.groupby(["longitude", "latitude"], sort=False).ngroup()
-    log[(stop % 16 == 0) & (log["device"] == "phone-a")].to_csv(tmp_path / "rsrp.csv", index=False)
+    log[(stop % 32 == 0) & (log["device"] == "phone-a")].to_csv(tmp_path / "rsrp.csv", index=False)
     typed("scene", "osm", TOWN / "town.osm", "--out", tmp_path / "town")
     told = typed(
         "init", tmp_path / "town" / "scene.xml", tmp_path / "rsrp.csv", "--transmitters", TOWN / "cells.csv",
@@ -44,7 +44,7 @@ def test_scene_init_run(tmp_path, monkeypatch):
     assert "averages too near the noise floor, left out" in shown
     result = Result.load(tmp_path / "result")
     assert result.provenance.rows["samples averaged"] == int(
-        ((stop % 16 == 0) & (log["device"] == "phone-a")).sum()
+        ((stop % 32 == 0) & (log["device"] == "phone-a")).sum()
     )
     # A level of the path loss less the received power: less what was transmitted.
     for cell, offset in result.nuisance.offsets_db.items():

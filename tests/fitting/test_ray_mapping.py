@@ -335,6 +335,7 @@ def test_an_engine_of_other_physics_is_not_understood(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ray_fit, "TRIALS", 5)
+    monkeypatch.setattr(ray_scan, "SCANNED", 16)  # no scan finds what this engine does
     strange = map_rays(foreign.problem, replace(foreign, ripple=0.1), most_calls=3)
     assert not strange.reached
     assert not strange.understood
@@ -359,6 +360,7 @@ def test_calls_go_on_while_the_minimum_is_not_at_the_best_call(
 ) -> None:
     """Any gap is accepted, as after a step that is too short to show how well the model predicts."""
     monkeypatch.setattr(ray_fit, "TRIALS", 0)
+    monkeypatch.setattr(ray_scan, "SCANNED", 16)
     finished: list[RayMap] = []
     finish = ray_mapping._finish
     monkeypatch.setattr(
