@@ -28,7 +28,7 @@ def typed(*words: object) -> str:
 
 
 def test_scene_init_run(tmp_path, monkeypatch):
-    """One phone at every second of its stops, so that it takes seconds; offsets of the cells are those planted."""
+    """One phone at every fourth of its stops, so that it takes seconds; offsets of the cells are those planted."""
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     truth = json.loads((TOWN / "truth.json").read_text())
     log = pd.read_csv(TOWN / "rsrp.csv")
