@@ -16,7 +16,8 @@ runs, and each part has one truth.
 With `--reference`, the distribution function of every parameter is compared with that of the given number of draws from
 the prior, weighted by the likelihood. This is an independent computation of the same posterior. The path loss of these
 draws is computed once per district. The distance is the largest difference between both functions; it counts if the
-reference has more than 1,000 effective draws.
+reference has more than 1,000 effective draws. `--members 64 256` shows populations as small as those of large programs,
+and larger ones where these disagree.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from calibray.optimizers import LeastSquares
 from calibray.study import Setup, Study
 from calibray.tables import Column, Table, numbers, render
 from calibray.uncertainty.joint_model import JointModel, joint_model
-from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior
+from calibray.uncertainty.sequential_monte_carlo import BUDGET, EVALUATIONS, draw_posterior
 from calibray.uncertainty.verdicts import credible_sets
 from finished_runs import append_run
 
@@ -127,10 +128,10 @@ class Reference:
 
 
 def run(
-    problem: Problem, levels: np.ndarray, number: int, seed: int, reference: Reference | None, budget: int
+    problem: Problem, levels: np.ndarray, seed: list[int], reference: Reference | None, members: list[int]
 ) -> dict[str, Any]:
     """Draw one truth; return whether the sets contain it, and the distance from the reference."""
-    random = np.random.default_rng([seed, number])
+    random, number = np.random.default_rng(seed), seed[-1]
     parameters, width = problem.parameters, len(problem.parameters)
     start = parameters.to_search(parameters.start)
     problem, truth = planted(problem, joint_model(problem, start, NOISE_DB**2, 10), levels, random)
@@ -140,7 +141,8 @@ def run(
     best = parameters.to_search(trail.best)
     freedom = problem.objective.num_counted - problem.unknowns
     model = joint_model(problem, best, float(trail.best_value**2), freedom)
-    posterior = draw_posterior(model, number, budget=budget)
+    budgets = [2 * EVALUATIONS * each * model.interactions for each in members] or [BUDGET]
+    posterior = draw_posterior(model, number, budget=budgets[0], largest_budget=budgets[-1])
     seconds = time.process_time() - started
     draws = posterior.means
     unit = (draws.point - lower) / (upper - lower)
@@ -199,7 +201,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--districts", default="development", help="names, or development or judging")
     parser.add_argument("--reference", type=int, default=0, help="draws from the prior; 0 for no reference")
-    parser.add_argument("--budget", type=int, default=BUDGET, help="interactions per posterior")
+    parser.add_argument(
+        "--members", type=int, nargs="+", default=[], help="of a population; then if they disagree"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
     parser.add_argument("--out", type=Path, help="append one line of JSON per run")
@@ -215,7 +219,7 @@ def main() -> None:
             made = None  # frees the memory first
             problem = five_parameters(name, given.folder)
             made = name, problem, Reference.of(problem, given.reference) if given.reference else None
-        line = run(made[1], levels[number], number, given.seed, made[2], given.budget)
+        line = run(made[1], levels[number], [given.seed, number], made[2], given.members)
         lines.append(line | {"district": name})
         append_run(given.out, lines[-1])
         print(f"{turn + 1} of {given.runs}", end="\r", file=sys.stderr)

@@ -345,6 +345,19 @@ def test_more_populations_are_drawn_while_their_halves_disagree(monkeypatch, int
     assert len(draws.weight) == pairs * len(draw_posterior(model, seed=1).means.weight)
 
 
+@pytest.mark.parametrize(("agree", "factor", "members"), [(False, 4, 256), (True, 4, 64), (False, 1, 64)])
+def test_small_populations_that_disagree_are_replaced_by_larger_ones(monkeypatch, agree, factor, members):
+    monkeypatch.setattr(module, "_distance", lambda *_: 0.0 if agree else 1.0)
+    model = _model(_parameters(), _uninformative, 4, buildings=0, interactions=1_000)
+    budget = 2 * module.EVALUATIONS * 64 * 1_000
+    posterior = draw_posterior(model, seed=1, budget=budget, largest_budget=factor * budget)
+    alone = draw_posterior(model, seed=1, budget=budget if members == 64 else factor * budget)
+    assert posterior.shape[2] == members
+    np.testing.assert_array_equal(posterior.joint, alone.joint)
+    # The first populations were evaluated too.
+    assert (posterior.replays > alone.replays) == (members == 256)
+
+
 def test_members_move_longer_where_draws_are_few_or_cheap(monkeypatch):
     monkeypatch.setattr(module, "LAST_SWEEPS", (8, 48))
     small, large, cheap = (

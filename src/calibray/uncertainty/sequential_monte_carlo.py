@@ -6,6 +6,7 @@ the population is effective, resamples the population, and moves its members (`p
 
 We start with two independent populations, and double their number as long as the two halves of the populations disagree
 and the budget allows it. If they agree, each population is weighted by its estimate of the evidence, which is unbiased.
+Small populations that disagree are replaced by larger ones if the calibration took long enough.
 """
 
 from __future__ import annotations
@@ -137,12 +138,25 @@ def draw_posterior(
     progress: Callable[[float], None] | None = None,
     budget: int = BUDGET,
     models: int = 1,
+    largest_budget: int = 0,
 ) -> Posterior:
     """Draw from the joint posterior.
 
     `progress` is called with the share of the work done after every step. The budget is the number of interactions that
-    may be evaluated; it is shared between the models if the draws of several models are pooled.
+    may be evaluated; it is shared between the models if the draws of several models are pooled. If populations disagree
+    and are small because of the budget, larger ones are drawn with the largest budget instead.
     """
+    posterior = _draw_populations(model, seed, progress, budget, models)
+    sizes = [population_size(model.interactions, each, models) for each in (budget, largest_budget)]
+    if posterior.means.agree or sizes[1] <= sizes[0]:
+        return posterior
+    larger = _draw_populations(model, seed, progress, largest_budget, models)
+    return replace(larger, replays=posterior.replays + larger.replays)
+
+
+def _draw_populations(
+    model: JointModel, seed: int, progress: Callable[[float], None] | None, budget: int, models: int
+) -> Posterior:
     size = population_size(model.interactions, budget, models)
     sweeps = last_sweeps(model.interactions, budget, models)
     replays, budget = 0, budget // models
