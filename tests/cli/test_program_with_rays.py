@@ -246,7 +246,7 @@ def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Pa
         (
             '{"path_loss_db": [70]}',
             "{name: [row[k] for row in rows] for k, name in enumerate(names)}",
-            "path loss instead of a ray table; remove rays = true",
+            "instead of a ray table; remove rays = true",
         ),
     ):
         program.write_text(correct.replace(right, wrong))

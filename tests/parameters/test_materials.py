@@ -94,7 +94,7 @@ def test_range_ends_are_included_and_nothing_beyond(revision):
         assert itu_material(name, lower, revision=revision).relative_permittivity >= 1
         assert itu_material(name, upper, revision=revision).relative_permittivity >= 1
         for outside in (lower * (1 - 1e-9), upper * (1 + 1e-9)):
-            with pytest.raises(InputError, match=f"{revision} covers '{name}' at|must be in"):
+            with pytest.raises(InputError, match=f"{revision} covers '{name}' at|must be from"):
                 itu_material(name, outside, revision=revision)
 
 
