@@ -150,7 +150,7 @@ class Answers:
         (lambda loss: None, "Answers returned a NoneType from path_loss; must be a NumPy array"),
         (lambda loss: loss.tolist(), "returned a list from path_loss"),
         (lambda loss: np.vstack([loss, loss]), r"shape \(2, .*with 1 rows"),
-        (lambda loss: loss[:, 1:], "returned path loss of .* links, must be"),
+        (lambda loss: loss[:, 1:], "returned path loss for .* links, but must return it for"),
         (lambda loss: np.where(np.arange(loss.shape[1]) == 3, np.nan, loss), "NaN or -inf .* of link 3"),
         (lambda loss: loss + 0j, "type complex128"),
     ],

@@ -119,8 +119,8 @@ class Problem:
             before = observable.modelled(engine, engine.parameters.start[None])[0]
         if before.shape != (len(links),):
             raise EngineError(
-                f"the engine {type(engine).__name__} returned path loss of {before.size} links, must be {len(links)}: "
-                "all links of the study, including held-out links"
+                f"the engine {type(engine).__name__} returned path loss for {before.size} links, but must return it "
+                f"for all {len(links)} links of the study, including held-out links"
             )
         censored = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
         objective = make_objective(

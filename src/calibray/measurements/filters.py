@@ -427,7 +427,7 @@ class _Interpreter:
             case ast.Attribute(value=ast.Attribute(value=owner, attr="str")):
                 method, column = _allowed(name, TEXT_METHODS), self._column(owner)
                 if not (pd.api.types.is_string_dtype(column.dtype) or column.dtype == object):
-                    raise self._refusal(owner, f"must be a column of texts; remove .str.{name}()")
+                    raise self._refusal(owner, f"must be a column of text; remove .str.{name}()")
                 return self._call_method(node, name, method, column)
             case ast.Attribute(value=owner):
                 method = _allowed(name, METHODS)

@@ -234,8 +234,8 @@ MIN_GAP_DB: Final = 20.0
 """Smallest difference between a code and every measured value [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
-"""Largest magnitude of a power [dBm] or gain [dB]. A listed code with a larger magnitude is a code regardless of its
-sign."""
+"""Largest plausible magnitude of a power [dBm] or gain [dB]. A listed code with a larger magnitude is a code regardless
+of its sign."""
 
 
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:

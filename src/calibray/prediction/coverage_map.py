@@ -71,9 +71,9 @@ def coverage_map(
         level: Probability that the interval contains a measurement; None for no interval.
         power_dbm: Transmitted power for a map of received power [dBm]; if None, the map shows path loss. After a
             calibration on RSRP, the default is 0, because the offset contains the power.
-        samples: Number of rays; if None, that of the study. Too few rays miss paths, and the time taken is proportional
-            to the number of rays. "auto" adds rays until path loss has converged, which takes less time than a large
-            number of rays from the start.
+        samples: Number of rays; if None, that of the study. With too few rays, paths are missing; the time taken is
+            proportional to the number of rays. "auto" adds rays until path loss has converged, which takes less time
+            than a large number of rays from the start.
         columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by column name.
             The group of an offset is taken from the links measured at this transmitter, if they share a group.
         progress: Called with the stage "tracing" after every launch.

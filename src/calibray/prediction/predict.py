@@ -92,9 +92,10 @@ def predict_interval(
 ) -> pd.DataFrame:
     """Predict path loss at new links, with an interval for a measurement there; see `Result.predict_interval`.
 
-    The width of the interval has up to three parts. The first is the size of single links' residuals, on held-out links
-    if the calibration has any. The second is the scatter of the draws; it is omitted if blocks were held out, because
-    their residuals include it. The third is the spread between groups, for links of a group without measurements.
+    The width of the interval has up to three parts. The first is the size of the residuals of individual links, on
+    held-out links if the calibration has any. The second is the scatter of the draws; it is omitted if blocks were held
+    out, because their residuals include it. The third is the spread between groups, for links of a group without
+    measurements.
 
     Raises:
         InputError: `predict` would refuse the input for a reason other than unknown groups; the level is not between 0

@@ -114,7 +114,7 @@ class TracePlan:
 
     @property
     def memory(self) -> int:
-        """Estimated memory of the trace, without the paths that it finds [bytes]."""
+        """Estimated memory that the trace needs, excluding the paths that it finds [bytes]."""
         return self.lanes * LANE_BYTES + self.buffer
 
     @property

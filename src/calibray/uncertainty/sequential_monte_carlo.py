@@ -78,7 +78,7 @@ class Posterior:
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
         replays: Number of evaluations of path loss for the draws.
-        shape: Number of populations, number of states of each member kept as draws, and members per population.
+        shape: Number of populations, of states per member that are kept as draws, and of members per population.
         log_evidence: Logarithm of the probability density of the measurements, averaged over the prior.
     """
 
