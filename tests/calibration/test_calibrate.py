@@ -25,6 +25,7 @@ from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
 from calibray.result.held_out import Model
+from calibray.result.verdict import RemarkKind
 from calibray.result.wording import judgement_text
 from calibray.study import Setup
 from calibray.tables import render
@@ -114,6 +115,38 @@ class BlackBox:
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
         self.calls += len(candidates)
         return planted.engine().path_loss(candidates)
+
+
+class Losing(BlackBox):
+    """The engine without its derivatives, whose first link has no path if the first permittivity exceeds 6."""
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        loss = super().path_loss(candidates)
+        loss[np.asarray(candidates)[:, 0] > 6.0, 0] = np.inf
+        return loss
+
+
+@pytest.mark.parametrize("engine", [BlackBox, Losing])
+def test_a_given_engine_and_the_calls_that_lose_a_link_are_named(tmp_path, exact, engine):
+    given = engine()
+    first, *others = given.parameters.items
+    given.parameters = replace(given.parameters, items=(replace(first, start=4.0), *others))
+    method = {"name": "random", "options": {"budget": 12}}
+    result = calibrate(planted.study(tmp_path, exact, method=method), engine=given)
+    of_kind = {remark.kind: remark.values for remark in result.uncertainty.remarks}
+    assert of_kind[RemarkKind.GIVEN_ENGINE] == {"engine": engine.__name__, "used": "replay"}
+    infinite = int(np.isinf(result.history.rmse_db).sum())
+    if engine is BlackBox:
+        assert infinite == 0
+        assert RemarkKind.LOST_PATHS not in of_kind
+    else:
+        assert 0 < infinite < 12
+        assert of_kind[RemarkKind.LOST_PATHS] == {
+            "calls": infinite,
+            "of": 12,
+            "rows": [int(result.links.row[0])],
+        }
+        assert "RT calls cannot be the result" in " ".join(result.remarks)
 
 
 @pytest.mark.parametrize("fits", [True, False])

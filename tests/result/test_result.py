@@ -165,6 +165,11 @@ def test_a_crash_while_saving_leaves_the_older_files(result, folder, monkeypatch
     assert {path.name: path.read_text() for path in folder.iterdir()} == before
 
 
+def test_the_file_of_a_result_is_refused_with_the_remedy(folder):
+    with pytest.raises(InputError, match=r"result\.json: is a file; give its folder"):
+        Result.load(folder / "result.json")
+
+
 def test_only_folders_with_a_result_are_loaded(folder, tmp_path):
     with pytest.raises(InputError, match="is not a result written by `calibray run`"):
         Result.load(tmp_path)

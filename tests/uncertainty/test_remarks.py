@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import planted
+from calibray.engines import Replay
 from calibray.fitting.problem import Problem
 from calibray.result.verdict import Interval, Remark, RemarkKind, Verdict
 from calibray.result.wording import remark_text
@@ -21,7 +22,8 @@ NAMES = tuple(planted.TRUTH)
 
 def remarks(optimum: dict[str, float], log_odds: float = 3.0, **sections: Any) -> tuple[str, ...]:
     study = Study.from_content(planted.content("links.csv", **{"noise": None, **sections}))
-    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
+    setup = Setup.open(study, links=links_from_frame(planted.links()))
+    problem = Problem.of(setup, Replay(planted.engine().paths, setup.parameters))
     pieces = ((2.0, 3.0), (6.0, 9.0))
     intervals = {name: Interval(0.1, 2.0, 9.0, Verdict.AMBIGUOUS, pieces) for name in NAMES}
     probable, noise = dict.fromkeys(NAMES, 7.0), {CORRELATED: 0.9, "gaussian": 0.1}
@@ -33,6 +35,16 @@ def remarks(optimum: dict[str, float], log_odds: float = 3.0, **sections: Any) -
 def test_values_within_their_intervals_give_no_remark():
     assert remarks(dict.fromkeys(NAMES, 2.5)) == ()
     assert remarks(dict.fromkeys(NAMES, 5.9)) == ()  # within the slack
+
+
+def test_the_slack_of_a_logarithmic_parameter_is_a_factor():
+    scaled = {name: {"bounds": list(planted.BOUNDS), "scale": "log"} for name in NAMES}
+    inside, outside = ({**dict.fromkeys(NAMES, 2.5), NAMES[1]: value} for value in (9.3, 1.9))
+    assert remarks(inside, parameters=scaled) == ()
+    assert remarks(outside, parameters=scaled)
+    # On a linear scale, it is the other way round.
+    assert remarks(inside)
+    assert remarks(outside) == ()
 
 
 def test_values_outside_their_intervals_are_named_with_the_reason():

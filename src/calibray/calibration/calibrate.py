@@ -15,7 +15,7 @@ from calibray.calibration.link_diagnostics import (
     region_remark,
     unreached_remark,
 )
-from calibray.calibration.make_result import Run, Timing, make_result
+from calibray.calibration.make_result import Run, Timing, given_engine_remark, make_result
 from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers, check_workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
@@ -72,7 +72,8 @@ def calibrate(
         seed: Seed to use instead of the study's.
         out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is also written
             there, so that a restarted run does not repeat completed calls.
-        engine: Engine for all links of the study; if None, the engine that the study specifies.
+        engine: Engine for all links of the study; if None, the engine that the study specifies. Predictions use the
+            study's engine.
         workers: Workers from `engines.open_workers`. They run the calls of a batch with the engine "command", or the
             chunks of links with the engine "replay". If None, everything runs in this process.
         progress: Called with the name of each stage, the completed work and the total.
@@ -116,6 +117,7 @@ def calibrate(
         setup = Setup.open(plan, tracer)
         for finding in suspicions(plan, setup.links):
             _LOG.warning("%s: %s; %s", finding.subject, finding.problem, finding.remedy)
+    given = engine
     if engine is None:
         check_fit(setup)
         ledger = None if out is None else Path(out) / LEDGER_FILE
@@ -164,7 +166,8 @@ def calibrate(
     # A wrong direction looks like a loss on one side of a transmitter, so regions are tested last.
     on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)
     on_links += groups_remark(problem, trail)
-    run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
+    remarks = (*given_engine_remark(setup, given), *of_rays, *on_links)
+    run = Run(problem, trail, gap_db, cheap, enclosed, remarks, timing)
     result = make_result(run, assessment, validation)
     if out is not None:
         # The folder was checked before the search; a file that has appeared since must not prevent saving.

@@ -22,7 +22,7 @@ from calibray.calibration.held_out_accuracy import (
 )
 from calibray.calibration.link_diagnostics import diagnose_links
 from calibray.calibration.result import Result
-from calibray.engines.protocol import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS, Engine
 from calibray.engines.replay import Replay
 from calibray.fitting.cheap_replay import CheapReplay
 from calibray.fitting.fidelity_loop import largest_gap
@@ -174,6 +174,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
                 *run.on_links,
+                *_lost_paths(problem, trail),
                 *_worse_than_start(problem, trail, nuisance_only if fitted else models.initial),
                 *_worse_than_mean(
                     problem, trail.best_rmse_db, rmse_of(problem, models.log_distance, counted)
@@ -220,6 +221,31 @@ def _retraced(
         "largest_db": largest_gap(gap_db, counted) or 0.0,
     }
     return (Remark(RemarkKind.RETRACED, values),)
+
+
+def given_engine_remark(setup: Setup, engine: Engine | None) -> tuple[Remark, ...]:
+    """A remark on an engine that the user wrote, if one was given, because predictions use that of the study."""
+    if engine is None or type(engine).__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return ()
+    values: dict[str, Value] = {"engine": type(engine).__name__, "used": setup.study.engine.name}
+    return (Remark(RemarkKind.GIVEN_ENGINE, values),)
+
+
+def _lost_paths(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
+    """A remark if links without a path make the objective infinite at some candidates; failed calls do not count."""
+    if problem.setup.study.engine.exports_rays or not trail.modelled:
+        return ()
+    reached = np.isfinite(trail.modelled)
+    wasted = reached.any(axis=1) & np.isinf(trail.rmse_db)
+    lost = ~reached[wasted].all(axis=0) & (problem.objective.weight > 0)
+    if not wasted.any():
+        return ()
+    values: dict[str, Value] = {
+        "calls": int(wasted.sum()),
+        "of": len(wasted),
+        "rows": problem.setup.links.row[lost].tolist(),
+    }
+    return (Remark(RemarkKind.LOST_PATHS, values),)
 
 
 def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float64]) -> tuple[Remark, ...]:

@@ -187,6 +187,8 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
             of several runs.
     """
     source = as_path(folder, "result") / RESULT_FILE
+    if source.parent.is_file():
+        raise InputError(f"{source.parent}: is a file; give its folder")
     stored, study = _read_stored(source)
     links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
     if not allow_changed_inputs:

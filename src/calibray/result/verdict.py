@@ -134,6 +134,8 @@ class RemarkKind(StrEnum):
     # when traced again: links that change by more than tolerance_db, of (all), largest_db; lost, the number of links
     # with a path in one trace only
     RETRACED = "retraced"
+    LOST_PATHS = "lost paths"  # calls, of (all), rows of the links without a path in these calls
+    GIVEN_ENGINE = "given engine"  # engine: its class; used, the name of the study's engine
     NOT_JUDGED = "not judged"
     MISSING_REGION = "missing region"  # west, south, east, north, height, attenuation, links, share, chance
     # transmitters; azimuth_deg and downtilt_deg, the corrections of their stated angles, and azimuth_error_deg,

@@ -419,6 +419,15 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.RAY_MAPPING: _ray_mapping,
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.RETRACED: _retraced,
+    RemarkKind.LOST_PATHS: lambda values: (
+        f"{values['calls']} of {values['of']} RT calls cannot be the result, because links that had a path at the "
+        f'initial values have none there ({rows_text(values["rows"])}). Set objective.no_path = "censor" and '
+        "objective.ceiling_db, or leave these links out."
+    ),
+    RemarkKind.GIVEN_ENGINE: lambda values: (
+        f"Path loss was computed by the engine {values['engine']}, which was passed to calibrate. Predictions, maps "
+        f"and suggestions use the study's engine {values['used']!r}; they are correct only if both engines agree."
+    ),
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.MISSING_REGION: _missing_region,
     RemarkKind.UNREACHED_LINKS: _unreached_links,

@@ -155,7 +155,8 @@ NOTABLE: Final = 0.25
 """Smallest posterior weight of a kind of noise that is reported; several kinds can share the weight."""
 
 SLACK: Final = 0.02
-"""A calibrated value is reported if its distance from its interval exceeds this share of the parameter's range."""
+"""A calibrated value is reported if its distance from its interval exceeds this share of the range of the search, which
+is logarithmic for a parameter with this scale."""
 
 MISSED_DB: Final = 0.01
 """The method is reported to have missed the optimum if a draw has an objective that is lower by at least this much
@@ -240,11 +241,17 @@ def outside_interval(
         log_odds: Log density of that draw minus that of the calibrated values.
         noise: Posterior weights of the noise models.
     """
-    outside = []
-    for parameter in problem.parameters:
-        interval, slack = intervals[parameter.name], SLACK * (parameter.upper - parameter.lower)
-        if interval.pieces and not interval.contains(optimum[parameter.name], slack):
-            outside.append(parameter.name)
+    parameters, outside = problem.parameters, []
+    values_of = np.array([optimum[name] for name in parameters.names])
+    for index, name in enumerate(parameters.names):
+        ends = np.tile(values_of, (2 * len(intervals[name].pieces) + 1, 1))
+        ends[1:, index] = np.ravel(intervals[name].pieces)
+        value, *pieces = parameters.to_unit(ends)[:, index]
+        below = [
+            low - SLACK <= value <= high + SLACK for low, high in zip(pieces[::2], pieces[1::2], strict=True)
+        ]
+        if below and not any(below):
+            outside.append(name)
     if not outside:
         return ()
     values: dict[str, Value] = {
