@@ -60,6 +60,15 @@ def test_links_get_the_columns_of_their_transmitters():
             select_rows(links, Preparation(transmitters=SourceTable(rows, source="sites.csv")))
 
 
+@pytest.mark.parametrize("table", ["log", "sites"])
+def test_a_column_of_transmitters_whose_new_name_exists_is_refused(table):
+    log, sites = pd.DataFrame({"cell": ["a"], "x": [7.0]}), pd.DataFrame({"cell": ["a"], "x": [5.0]})
+    log, sites = (log.assign(cell_x=1.0), sites) if table == "log" else (log, sites.assign(cell_x=1.0))
+    steps = Preparation(transmitters=SourceTable(sites, source="sites.csv"), transmitter="cell")
+    with pytest.raises(InputError, match=r"sites\.csv: column 'x' would become 'cell_x', because log\.csv .* rename"):
+        select_rows(SourceTable(log, source="log.csv"), steps)
+
+
 def test_powers_at_or_below_the_noise_floor_are_left_out_or_set_to_it():
     rows = SourceTable(pd.DataFrame({"power": [-100.0, -120.0, -119.9, np.nan, -130.0]}))
     left = select_rows(rows, Preparation(noise_floor_dbm=-120.0), "power")

@@ -205,6 +205,12 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
     joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
     # Columns of the links keep their names, because filters and positions refer to them.
     renamed = {name: f"{key}_{name}" if name in table.frame else str(name) for name in joined}
+    for name, new in renamed.items():
+        if new in table.frame or list(renamed.values()).count(new) > 1:
+            raise InputError(
+                f"{transmitters.source}: column {name!r} would become {new!r}, because {table.source} also has a "
+                f"column {name!r}, but a column {new!r} already exists; rename column {name!r} in one of these tables"
+            )
     joined = joined.rename(columns=renamed)
     origin = {new: (transmitters.source, str(name), key) for name, new in renamed.items()}
     frame = pd.concat([table.frame.reset_index(drop=True), joined.reset_index(drop=True)], axis=1)
