@@ -167,3 +167,14 @@ def test_a_track_of_another_age_is_refused(tmp_path, year):
     rows = SourceTable(pd.DataFrame({"time": ["2020-01-01T00:00:01Z"]}))
     with pytest.raises(InputError, match=r"walk\.gpx: a time is not in ISO 8601 or is out of range"):
         join_track(rows, Track(str(tmp_path / "walk.gpx"), "time"))
+
+
+def test_rows_of_one_transmitter_in_two_spellings_are_averaged_together():
+    log = pd.DataFrame({"cell": ["A-1", "a:1", "B"], "x": [10.0, 10.0, 10.0], "loss": [80.0, 90.0, 85.0]})
+    sites = SourceTable(pd.DataFrame({"name": ["A-1", "b"], "z": [20.0, 30.0]}))
+    steps = Preparation(transmitters=sites, transmitter="cell", averaging=Averaging("place"))
+    described = LinkColumns((0.0, 0.0, "z"), ("x", 0.0, 1.5), "loss", group="cell")
+    links = measured_links(SourceTable(log), described, steps)
+    assert links.path_loss_db == pytest.approx([82.596, 85.0], abs=1e-3)
+    assert links.group.tolist() == ["A-1", "b"]
+    assert links.prepared == {"samples averaged": 3}

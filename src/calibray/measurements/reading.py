@@ -26,7 +26,7 @@ from calibray.measurements import column_names
 from calibray.measurements.links import FEW, Measurements
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, clear_buildings, place_rows, read_times
 from calibray.measurements.preparation import Averaging, LinkColumns, Preparation, Quantity
-from calibray.measurements.selection import choose_rows, complete_rows, select_rows
+from calibray.measurements.selection import choose_rows, comparison, complete_rows, select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import read_table
 from calibray.support.messages import shortened
@@ -104,7 +104,12 @@ def _note_unused(
     for name in dict.fromkeys([*groups, steps.transmitter]):
         if name not in table.frame or name not in chosen.frame:
             continue
-        unused = ~chosen.frame[name].isin(table.frame[name])
+        used, rows = table.frame[name], chosen.frame[name]
+        if name == steps.transmitter and steps.transmitters is not None:
+            # The join has changed the spelling of these names.
+            compared = comparison(used.unique())
+            used, rows = pd.Series(compared(used)), pd.Series(compared(rows))
+        unused = ~rows.isin(used)
         labels = chosen.frame[name][unused].dropna().unique().tolist()
         if labels:
             listed = ", ".join(shortened(str(label)) for label in labels[:5]) + (

@@ -182,7 +182,10 @@ def repeated_label(transmitters: SourceTable, column: str) -> str:
 
 
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Add the columns of the table of transmitters to the links; its column of names need not be named `key`."""
+    """Add the columns of the table of transmitters to the links, and spell their transmitters as in that table.
+
+    Its column of names need not be named `key`.
+    """
     transmitters = distinct_rows(transmitters)
     label_of_link = table.labels(key).tolist()
     name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
@@ -202,7 +205,12 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
             f"rows; {did_you_mean(str(unknown[0]), labels)}; or add them to that table, or remove these rows, "
             f'in a study with links.where = "`{key}` not in [{cells}]"'
         )
-    joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
+    index = [index_of_label[label] for label in compared_of_link]
+    spelled = np.array(labels)[index]
+    # Two spellings of one name must not become two groups.
+    if (spelled != label_of_link).any():
+        table = table.assign(**{key: spelled})
+    joined = transmitters.frame.drop(columns=name).iloc[index]
     # Columns of the links keep their names, because filters and positions refer to them.
     renamed = {name: f"{key}_{name}" if name in table.frame else str(name) for name in joined}
     for name, new in renamed.items():
