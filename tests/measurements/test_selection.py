@@ -65,7 +65,9 @@ def test_a_column_of_transmitters_whose_new_name_exists_is_refused(table):
     log, sites = pd.DataFrame({"cell": ["a"], "x": [7.0]}), pd.DataFrame({"cell": ["a"], "x": [5.0]})
     log, sites = (log.assign(cell_x=1.0), sites) if table == "log" else (log, sites.assign(cell_x=1.0))
     steps = Preparation(transmitters=SourceTable(sites, source="sites.csv"), transmitter="cell")
-    with pytest.raises(InputError, match=r"sites\.csv: column 'x' would become 'cell_x', because log\.csv .* rename"):
+    with pytest.raises(
+        InputError, match=r"sites\.csv: column 'x' would become 'cell_x', because log\.csv .* rename"
+    ):
         select_rows(SourceTable(log, source="log.csv"), steps)
 
 

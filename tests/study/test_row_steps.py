@@ -117,6 +117,18 @@ def test_positions_to_predict_at_are_read_as_measured_ones(folder, monkeypatch):
         plan.places(SourceTable(log[["phone"]], source="new.csv"))
 
 
+def test_positions_of_transmitters_come_from_their_table_in_predictions_too(folder, caplog):
+    """A column of the new table has the name of a coordinate of the transmitters."""
+    log = pd.read_csv(folder / "log.csv").drop(columns="rsrp")
+    links = study(folder).places(SourceTable(log.assign(height=1.5), source="new.csv"))
+    assert links.tx[:, 2] == pytest.approx(study(folder).places(SourceTable(log)).tx[:, 2])
+    assert "new.csv: column height is ignored, because the calibration has it from" in caplog.text
+    # A column that the measured links have themselves is theirs in predictions too.
+    (folder / "own.csv").write_text((folder / "log.csv").read_text().replace("rsrp", "height"))
+    own = study(folder, file="own.csv", value="height").places(SourceTable(log.assign(height=12.0)))
+    assert own.tx[:, 2] == pytest.approx(12.0, abs=0.01)
+
+
 def test_the_study_s_own_table_is_not_taken_for_one_in_metres_without_a_word(folder, monkeypatch, caplog):
     """Its columns have the names of positions in the scene's frame, but other units or heights."""
     monkeypatch.setattr(row_steps, "_ground", lambda _: lambda x, y: 0.1 * x)

@@ -185,6 +185,9 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
     """Add the columns of the table of transmitters to the links, and spell their transmitters as in that table.
 
     Its column of names need not be named `key`.
+
+    Raises:
+        InputError: A name is repeated or unknown, or a new column would have the name of another one.
     """
     transmitters = distinct_rows(transmitters)
     label_of_link = table.labels(key).tolist()

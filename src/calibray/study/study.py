@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from numbers import Real
 from pathlib import Path
 from tempfile import mkdtemp
@@ -25,11 +25,13 @@ from calibray.measurements import (
     links_from_table,
     mask_codes,
     melt,
+    read_table,
     select_rows,
 )
 from calibray.scenes import write_scene
 from calibray.study.calibration_sections import OFFSET, HoldoutSection
 from calibray.study.model import StudyModel
+from calibray.study.mounting import mounting_columns
 from calibray.study.row_steps import position_steps, row_track, study_links
 from calibray.study.setup import Setup
 from calibray.study.toml_file import study_text
@@ -162,6 +164,7 @@ class Study(StudyModel):
             table, _ = mask_codes(table, list(wide), links.missing)
             table = melt(table, wide, links.value, links.transmitter, keep_empty=True)
         steps = position_steps(self)
+        table = self._freed_for_join(table, steps)
         if links.track is not None and links.track.time in columns and not columns & {*TRACK_COLUMNS}:
             rows, table = len(table), select_rows(table, Preparation(track=row_track(self)))
             if len(table) < rows:
@@ -172,6 +175,23 @@ class Study(StudyModel):
         elif not wide and not columns & {*links.tx, *links.rx}:
             return links_from_table(table, group, links.frequency)
         return links_from_table(table, group, links.frequency, steps=steps, tx=links.tx, rx=links.rx)
+
+    def _freed_for_join(self, table: SourceTable, steps: Preparation) -> SourceTable:
+        """The table with new names for columns that the study's links got from the table of transmitters.
+
+        Otherwise the joined columns would get other names, because the table's columns keep theirs.
+        """
+        if steps.transmitters is None:
+            return table
+        used = {*self.links.tx, *mounting_columns(self)} - {*self.links.rx, self.links.transmitter}
+        shared = used & {*table.frame} & {*steps.transmitters.frame}
+        joined = shared - {*read_table(self.links_path).frame} if shared else shared
+        if joined:
+            _LOG.warning(
+                "%s: column %s is ignored, because the calibration has it from %s; rename it to avoid this warning",
+                table.source, ", ".join(sorted(joined)), self.transmitters_path,
+            )  # fmt: skip
+        return replace(table, frame=table.frame.rename(columns={name: f"input_{name}" for name in joined}))
 
     def opened(self) -> Setup:
         """Open the study: read its links, scene and parameters (see `Setup.open`)."""
