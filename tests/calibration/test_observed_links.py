@@ -271,6 +271,15 @@ def test_values_are_computed_from_a_file_of_components(tmp_path, table, engine):
         Problem.of(Setup.open(study), engine)
 
 
+def test_the_filter_of_an_observable_is_applied_before_rows_are_merged(tmp_path, table, engine):
+    other = table.assign(spread_ns=1e6, state="NLOS")
+    rows = pd.concat([other, table.assign(state="LOS")], ignore_index=True)
+    section = SPREAD | {"where": "state == 'LOS'"}
+    study = planted.study(tmp_path, rows, **(PLAN | {"observables": {"spread": section}}))
+    (each,) = Problem.of(Setup.open(study), engine).observed
+    assert each.measured == pytest.approx(table.spread_ns)
+
+
 def test_a_number_for_a_missing_time_of_flight_is_no_time(tmp_path, table):
     rtt_ns = table.rtt_ns.where(table.index != 3, -200.0)
     study = planted.study(tmp_path, table.assign(rtt_ns=rtt_ns), **(PLAN | {"observables": {"rtt": FLIGHT}}))

@@ -325,6 +325,30 @@ def test_rows_of_groups_stay_apart_and_repeats_average_observables(tmp_path):
         assert links.frame["ns"].tolist() == [15.0, 30.0]
 
 
+@pytest.mark.parametrize("links", [{}, {"average": "place"}], ids=["merged", "averaged"])
+def test_values_that_the_filter_of_an_observable_excludes_do_not_enter_the_mean(tmp_path, links):
+    table = {
+        "ns": [90.0, 50.0, 70.0],
+        "state": ["NLOS", "LOS", "NLOS"],
+        "x": [5.0, 5.0, 9.0],
+        "loss": [80.0] * 3,
+    }
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    spread = {"kind": "rms_delay_spread", "column": "ns", "unit": "ns"}
+    section = {"file": "log.csv", "tx": [0.0, 0.0, 9.0], "rx": ["x", 0.0, 1.5], "value": "loss", **links}
+    filters = {"near": "state == 'LOS'", "far": "state != 'LOS'", "free": "straight_walls == 0"}
+    content = STUDY | {
+        "links": section, "observables": {name: spread | {"where": text} for name, text in filters.items()}
+    }  # fmt: skip
+    del content["offset"]
+    frame = Study.from_content(content, tmp_path / "study.toml").measurements().frame
+    assert frame["ns [near]"].tolist() == pytest.approx([50.0, np.nan], nan_ok=True)
+    assert frame["ns [far]"].tolist() == [90.0, 70.0]
+    # The columns of this filter are computed for the links.
+    assert frame["ns"].tolist() == [70.0, 70.0]
+    assert "ns [free]" not in frame
+
+
 REPEATED = pd.DataFrame({
     "x": [10.0, 20.0, 30.0, 30.0, 10.0, 20.0], "day": [1, 1, 1, 1, 2, 2],
     "loss": [80.0, 82.0, 84.0, 84.0, 90.0, 92.0],

@@ -27,6 +27,7 @@ from calibray.measurements.multipath import (
 )
 from calibray.measurements.observables import PROFILES, SIGNED, Statistic
 from calibray.study import Setup
+from calibray.study.observables import FILTERED
 
 LEAST: Final = 1e-6
 """Smallest standard deviation of an observable's errors, relative to that of its values."""
@@ -119,11 +120,10 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
         )
     every, read = [], cache(_read)
     for name, section in sections.items():
+        filtered = FILTERED.format(column=section.column, name=name)
         if section.file is None:
-            place, measured = (
-                f"column {section.column!r}",
-                links.table.numbers(str(section.column), gaps=True),
-            )
+            column = filtered if filtered in links.frame else str(section.column)
+            place, measured = f"column {section.column!r}", links.table.numbers(column, gaps=True)
             if section.kind not in SIGNED and len(wrong := np.flatnonzero(measured < 0)):
                 raise InputError(
                     f"{links.table.cell(int(wrong[0]), str(section.column))}: {measured[wrong[0]]:g}: a {section.kind} "
@@ -138,7 +138,7 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             values = measure(source, section.statistic)
             place = f"{path}"
             measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
-        if section.where is not None:
+        if section.where is not None and filtered not in links.frame:
             measured = np.where(links.where(section.where), measured, np.nan)
         count = int(np.isfinite(measured[~setup.held_out]).sum())
         if count < 2:

@@ -333,10 +333,11 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     # `std_db` and `count` are computed for the averages, so they are not columns of the samples.
     stated = {columns.weight, columns.std} - {"std_db", "count"}
     weights = [str(name) for name in stated if name in table.frame]
+    observables = [name for name in steps.observables if name in table.frame]
     averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
         **{columns.value: sign * mean_level},
         **{name: mean[name].to_numpy() for name in rx},
-        **{name: _means(table, name, group) for name in (*steps.observables, *weights)},
+        **{name: _means(table, name, group) for name in (*observables, *weights)},
         std_db=groups["level"].std().to_numpy(),
         count=count.to_numpy(),
     )
@@ -434,7 +435,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     for name in (columns.weight, columns.std):
         if isinstance(name, str):
             merged[name] = pd.Series(table.numbers(name)).groupby(link).mean().to_numpy()
-    for name in steps.observables:
+    for name in [name for name in steps.observables if name in table.frame]:
         merged[name] = _means(table, name, link)
     table = table.note("rows that repeat a link, merged", int((~first).sum()))
     return _note_steps(table, link, level, value > floor, list(map(str, keys))).select(first).assign(**merged)

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from typing import Annotated, Final, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
+from calibray.measurements import SourceTable
 from calibray.measurements.multipath import MARGIN_DB
 from calibray.measurements.observables import FLIGHTS, KINDS, PROFILES, SECTORS, Statistic, Wanted
 from calibray.support.strict_models import Section, Text
@@ -21,6 +23,9 @@ UNITS: Final = {
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
 }
 """Accepted units of each dimension, with their values in SI units."""
+
+FILTERED: Final = "{column} [{name}]"
+"""Name of the column with the values of an observable that pass its filter."""
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -175,3 +180,18 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
             raise InputError(f"observables: {double[0]!r} is also the name of a bin; choose another name")
         split |= parts
     return split
+
+
+def filtered_values(section: ObservableSection, table: SourceTable) -> NDArray[np.float64] | None:
+    """Values of an observable [rows] in the study's unit, NaN for rows that its filter excludes.
+
+    None if the filter cannot be applied to the rows, for example because the links get one of its columns later.
+
+    Raises:
+        InputError: The column of values cannot be used.
+    """
+    values = table.numbers(str(section.column), gaps=True)
+    try:
+        return np.where(table.where(str(section.where)), values, np.nan)
+    except InputError:
+        return None

@@ -34,10 +34,12 @@ from calibray.study.mounting import (
     port_power,
     states_port_power,
 )
+from calibray.study.observables import FILTERED, filtered_values
 from calibray.study.regions import Place
 
 if TYPE_CHECKING:
     from calibray.measurements import Ground, MoveOutside
+    from calibray.measurements.preparation import Compute
     from calibray.scenes.checks import SceneSurfaces
     from calibray.scenes.obstruction import Region
 
@@ -82,6 +84,12 @@ def row_steps(study: StudyModel) -> Preparation:
     # Columns computed from the scene are added to the links later.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
     keep += [links.frequency] if links.frequency else []
+    # Values that a filter excludes must not enter the means of links.
+    filtered: dict[str, Compute] = {
+        FILTERED.format(column=item.column, name=name): partial(filtered_values, item)
+        for name, item in study.observables.items()
+        if item.column is not None and item.where is not None
+    }
     return replace(
         position_steps(study),
         track=row_track(study),
@@ -95,9 +103,12 @@ def row_steps(study: StudyModel) -> Preparation:
             dict.fromkeys([*keep, *mounting_columns(study), *([links.device] if links.device else [])])
         ),
         held_out=None if study.holdout is None else partial(_held_out_parts, study.holdout, links.value),
-        observables=[item.column for item in study.observables.values() if item.column is not None],
+        observables=[
+            *(item.column for item in study.observables.values() if item.column is not None),
+            *filtered,
+        ],
         flights=[item.column for item in study.observables.values() if item.column and item.kind in FLIGHTS],
-        computed={PORT_POWER: partial(port_power, study)} if states_port_power(study) else {},
+        computed=filtered | ({PORT_POWER: partial(port_power, study)} if states_port_power(study) else {}),
         check=partial(check_mounting_columns, study),
         inside=inside,
         outside=None if inside is None else _move_outside(study),
