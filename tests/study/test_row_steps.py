@@ -349,6 +349,31 @@ def test_values_that_the_filter_of_an_observable_excludes_do_not_enter_the_mean(
     assert "ns [free]" not in frame
 
 
+@pytest.mark.parametrize("links", [{}, {"average": "place"}], ids=["merged", "averaged"])
+def test_numeric_columns_that_a_study_uses_are_means_of_the_rows_of_a_link(tmp_path, links):
+    table = {
+        "load": [0.0, 100.0, 70.0],
+        "count": 1,
+        "gps_m": [1.0, 3.0, 4.0],
+        "x": [5.0, 5.0, 9.0],
+        "loss": [80.0] * 3,
+    }
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    section = {"file": "log.csv", "tx": [0.0, 0.0, 9.0], "rx": ["x", 0.0, 1.5], "value": "loss", "std": 2.0}
+    content = STUDY | {
+        "links": section | {"position_error_m": "gps_m"} | links,
+        "nuisance": {
+            "load": {"by": "load"},
+            "x": {"by": "x"},
+            "n": {"by": "count"},
+            "constant": {"by": "constant"},
+        },
+    }
+    del content["offset"]
+    frame = Study.from_content(content, tmp_path / "study.toml").measurements().frame
+    assert frame[["load", "gps_m", "x"]].to_numpy().tolist() == [[50.0, 2.0, 5.0], [70.0, 4.0, 9.0]]
+
+
 REPEATED = pd.DataFrame({
     "x": [10.0, 20.0, 30.0, 30.0, 10.0, 20.0], "day": [1, 1, 1, 1, 2, 2],
     "loss": [80.0, 82.0, 84.0, 84.0, 90.0, 92.0],

@@ -138,7 +138,7 @@ class Preparation:
         keep: Columns whose labels define groups that are averaged separately, in addition to the transmitter column.
         held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
             merged across parts.
-        observables: Columns of additional measured values, which are averaged over the rows of a link.
+        observables: Columns of additional numbers, such as delays, which are averaged over the rows of a link.
         flights: Columns of times of flight, in which certain numbers can represent missing values.
         computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
             been added. A function returns None if an optional column that it requires is missing.

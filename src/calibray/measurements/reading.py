@@ -331,13 +331,12 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     table = _note_steps(table, group, level, samples["below"].to_numpy() == 0, keys)
 
     # `std_db` and `count` are computed for the averages, so they are not columns of the samples.
-    stated = {columns.weight, columns.std} - {"std_db", "count"}
-    weights = [str(name) for name in stated if name in table.frame]
-    observables = [name for name in steps.observables if name in table.frame]
+    stated = {columns.weight, columns.std, *steps.observables} - {"std_db", "count"}
+    numeric = [str(name) for name in stated if name in table.frame]
     averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
         **{columns.value: sign * mean_level},
         **{name: mean[name].to_numpy() for name in rx},
-        **{name: _means(table, name, group) for name in (*observables, *weights)},
+        **{name: _means(table, name, group) for name in numeric},
         std_db=groups["level"].std().to_numpy(),
         count=count.to_numpy(),
     )

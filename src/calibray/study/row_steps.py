@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
 from calibray.measurements import (
+    POSITION_COLUMNS,
     Averaging,
     LinkColumns,
     Measurements,
@@ -90,6 +91,9 @@ def row_steps(study: StudyModel) -> Preparation:
         for name, item in study.observables.items()
         if item.column is not None and item.where is not None
     }
+    # Means of equal labels and positions could differ from them in the last digit.
+    others = {*keep, *links.tx, *links.rx, *POSITION_COLUMNS, links.value, "constant", "log_distance"}
+    means = {*(term.by for term in study.nuisance_terms.values()), links.position_error_m}
     return replace(
         position_steps(study),
         track=row_track(study),
@@ -106,6 +110,7 @@ def row_steps(study: StudyModel) -> Preparation:
         observables=[
             *(item.column for item in study.observables.values() if item.column is not None),
             *filtered,
+            *sorted(name for name in means - others if isinstance(name, str)),
         ],
         flights=[item.column for item in study.observables.values() if item.column and item.kind in FLIGHTS],
         computed=filtered | ({PORT_POWER: partial(port_power, study)} if states_port_power(study) else {}),
