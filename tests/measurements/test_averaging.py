@@ -93,6 +93,15 @@ def test_cells_stretches_and_windows(by, size, first_rows):
         assert average(rows | {"t": with_fraction}, by, size, time="t").row.tolist() == first_rows
 
 
+def test_each_device_has_its_own_distance_travelled():
+    """The rows of two phones, 90 m apart, alternate."""
+    rows = {"rx_x": [0.0, 90.0, 2.0, 92.0, 6.0, 96.0], "rx_y": 1.0, "power": -80.0, "phone": ["a", "b"] * 3}
+    averages = average(rows, "distance", 5.0, keep=["phone"])
+    assert averages.frame[["phone", "rx_x", "count"]].to_numpy().tolist() == [
+        ["a", 1.0, 2], ["b", 91.0, 2], ["a", 6.0, 1], ["b", 96.0, 1],
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("key", ["weight", "std"])
 def test_weights_and_deviations_of_averages_are_means(key):
     rows = pd.DataFrame({"x": [0.0, 0.1, 9.0], "power": -80.0, "own": [1.0, 5.0, 2.0]})

@@ -86,7 +86,8 @@ class Averaging:
 
     Attributes:
         by: Samples that are averaged together: samples at one "place" (the same receiver position), in one "cell" of a
-            square grid, in one interval of "distance" travelled (in the order of the rows), or in one window of "time".
+            square grid, in one interval of "distance" travelled (in the order of the rows, separately for rows that are
+            not averaged, such as those of different devices), or in one window of "time".
         size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.

@@ -298,8 +298,9 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     rx = [str(name) for name in columns.rx]
     keys = [*_separating_columns(table, steps, columns), *map(str, columns.tx)]
     labels = pd.DataFrame({name: table.column(name) for name in keys})
-    labels[_AREA] = _areas(table, averaging, rx)
     labels[_PART] = 0 if steps.held_out is None else steps.held_out(table)
+    apart = np.asarray(labels.groupby(list(labels), sort=False, dropna=False).ngroup(), dtype=np.int64)
+    labels[_AREA] = _areas(table, averaging, rx, apart)
     group = np.asarray(labels.groupby(list(labels), sort=False, dropna=False).ngroup(), dtype=np.int64)
 
     samples = pd.DataFrame({name: table.numbers(name) for name in rx})
@@ -345,8 +346,16 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     return averages.keep(enough, f"averages of fewer than {averaging.minimum_count} samples, left out")
 
 
-def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArray[np.int64]:
-    """Index of the position, cell, interval or window of each row [rows]; `rx` names the columns of x, y and z [m]."""
+def _areas(
+    table: SourceTable, averaging: Averaging, rx: Sequence[str], apart: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Index of the position, cell, interval or window of each row [rows]; `rx` names the columns of x, y and z [m].
+
+    Rows with different numbers in `apart` [rows] are not averaged, so each number has its own distance travelled.
+
+    Raises:
+        InputError: A column is not numeric, a time cannot be read, or the size is not a number greater than 0.
+    """
     if averaging.by == "place":
         positions = np.stack([table.numbers(name) for name in rx], axis=1)
         return join_positions(positions)
@@ -357,9 +366,10 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
         return np.floor((elapsed - elapsed.min()) / averaging.size).astype(np.int64)
     positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
     if averaging.by == "distance":
-        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-        # Stretches of equal distance along the track, in the order of the rows.
-        return np.floor(np.cumsum([0.0, *steps]) / averaging.size).astype(np.int64)
+        # Stretches of equal distance along each track, in the order of its rows.
+        steps = pd.DataFrame(positions).groupby(apart).diff().fillna(0.0)
+        travelled = pd.Series(np.linalg.norm(steps, axis=1)).groupby(apart).cumsum()
+        return np.floor(travelled / averaging.size).to_numpy(dtype=np.int64)
     cells = np.floor(positions / averaging.size).astype(np.int64)
     return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
 
