@@ -115,6 +115,8 @@ def test_rows_left_out_by_the_filter_may_be_faulty(tmp_path):
 def test_a_hold_out_filter_leaves_links_on_both_sides(tmp_path):
     links = read(tmp_path)
     assert links.held_out("x > 15 or y > 35").tolist() == [False, True, False, True]
+    # The table names the positions x and y.
+    assert links.held_out("rx_x > 15 or rx_y > 35").tolist() == [False, True, False, True]
     with pytest.raises(InputError, match="no link for the hold-out"):
         links.held_out("x > 1000")
     with pytest.raises(InputError, match="no link for calibration"):

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.materials import FREQUENCIES
+from calibray.measurements.placement import position_columns
 from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
@@ -184,12 +185,14 @@ class Measurements:
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that pass a filter on the columns of the source table.
+        """Mask [links] of the links that pass a filter on the columns of the source table and on `POSITION_COLUMNS`.
 
         Raises:
             InputError: The filter is not valid (see `SourceTable.where`).
         """
-        return self.table.where(expression)
+        positions = position_columns(self.tx, self.rx)
+        missing = {name: values for name, values in positions.items() if name not in self.table.frame}
+        return self.table.assign(**missing).where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
         """Mask [links] of the links that a filter holds out, which must be at least one but not all.
