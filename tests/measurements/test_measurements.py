@@ -98,6 +98,14 @@ def test_a_number_is_one_label_beside_fractions_and_alone():
     assert one.labels("carrier [GHz]").tolist() == ["26"]
 
 
+def test_labels_that_become_equal_when_joined_are_refused():
+    table = SourceTable(pd.DataFrame({"g": ["a b", "a"], "k": ["c", "b c"]}), source="log.csv")
+    with pytest.raises(
+        InputError, match=r"log\.csv: columns g, k: \('a b', 'c'\) and \('a', 'b c'\) are .*'a b c'"
+    ):
+        table.labels(["g", "k"])
+
+
 def test_filters_see_all_columns_and_keep_the_lines(tmp_path):
     links = read(tmp_path, where="set == 'NLOS' and spread > 3")
     assert links.row.tolist() == [4, 5]

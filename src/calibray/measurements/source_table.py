@@ -154,11 +154,20 @@ class SourceTable:
         """A column as labels [rows], or the labels of several columns joined by spaces.
 
         Raises:
-            InputError: There is no such column, or a label is missing.
+            InputError: There is no such column, a label is missing, or different labels are equal when joined.
         """
         if not isinstance(names, str):
-            parts = [self.labels(name).tolist() for name in names]
-            return np.array([" ".join(labels) for labels in zip(*parts, strict=True)], dtype=np.str_)
+            rows = list(zip(*(self.labels(name).tolist() for name in names), strict=True))
+            joined: dict[str, tuple[str, ...]] = {}
+            for labels in rows:
+                other = joined.setdefault(" ".join(labels), labels)
+                if other != labels:
+                    raise InputError(
+                        f"{self.source}: columns {', '.join(names)}: {shortened(str(other))} and "
+                        f"{shortened(str(labels))} are both written {shortened(' '.join(labels))!r} when joined; "
+                        "rename one of these labels"
+                    )
+            return np.array([" ".join(labels) for labels in rows], dtype=np.str_)
         column = self.column(names)
         if (missing := column.isna().to_numpy()).any():
             first = int(np.flatnonzero(missing)[0])
