@@ -316,7 +316,16 @@ LATER = TABLE.splitlines()[1:]
             "appears to be in degrees",
         ),
         # Values
-        (TABLE + "0,50,1.5,,LOS,1\n", {}, r"'loss' is missing or not finite in 1 of 5 rows \(row 6\)"),
+        (
+            TABLE + "0,50,1.5,,LOS,1\n",
+            {},
+            r"'loss' is missing or not finite in 1 of 5 rows \(row 6\).*`loss`\.notna\(\)\"$",
+        ),
+        (
+            TABLE + "0,50,1.5,,LOS,1\n",
+            {"quantity": "rsrp"},
+            r"`loss`\.notna\(\)\"; .* links\.noise_floor_dbm$",
+        ),
         (TABLE + "0,50,1.5,inf,LOS,1\n0,60,1.5,nan,LOS,1\n", {}, r"in 2 of 6 rows \(row 6, 7\)"),
         (TABLE + "0,50,1.5,n.m.,LOS,1\n", {}, "row 6, column 'loss': 'n.m.' is not a number"),
         (

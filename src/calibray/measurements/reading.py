@@ -90,6 +90,11 @@ def measured_links(
     table = complete_rows(chosen, steps, columns.value)
     table, tx, rx = place_rows(table, steps, columns.tx, columns.rx)
     columns = replace(columns, tx=tx, rx=rx)
+    # Rows without a value can be errors or powers too weak to measure, so the user decides.
+    remedy = f'leave out these rows, in a study with links.where = "`{columns.value}`.notna()"'
+    if columns.quantity in ("rsrp", "received_power"):
+        remedy += "; if the powers were too weak to measure, state links.noise_floor_dbm"
+    table.numbers(columns.value, remedy=remedy)
     table = average_samples(table, steps, columns)
     table = merge_repeats(table, steps, columns)
     table = clear_buildings(table, steps, columns.rx)

@@ -101,8 +101,12 @@ class SourceTable:
             )
         return self.frame[name]
 
-    def numbers(self, source: str | float, gaps: bool = False) -> NDArray[np.float64]:
+    def numbers(
+        self, source: str | float, gaps: bool = False, remedy: str = "remove these rows"
+    ) -> NDArray[np.float64]:
         """A column as finite numbers [rows], or a number repeated for all rows. With `gaps`, missing values are NaN.
+
+        Messages about missing values end with `remedy`.
 
         Raises:
             InputError: There is no such column, or a value is missing, infinite or not a number.
@@ -126,12 +130,12 @@ class SourceTable:
         if (text := parsed.isna().to_numpy() & ~missing).any():
             first = int(np.flatnonzero(text)[0])
             value = column.iloc[first]
-            remedy = "correct it"
+            correction = "correct it"
             if str(value).strip().startswith(("<", "≤")):
-                remedy = "write the limit without this sign, and state links.noise_floor_dbm"
+                correction = "write the limit without this sign, and state links.noise_floor_dbm"
             elif re.fullmatch(r"[+-]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?", str(value).strip()):
-                remedy = "remove the thousands separators"
-            raise InputError(f"{self.cell(first, source)}: {value!r} is not a number; {remedy}")
+                correction = "remove the thousands separators"
+            raise InputError(f"{self.cell(first, source)}: {value!r} is not a number; {correction}")
         numbers = parsed.to_numpy(dtype=np.float64, na_value=np.nan)
         unusable = np.isinf(numbers) if gaps else ~np.isfinite(numbers)
         if unusable.any():
@@ -141,12 +145,12 @@ class SourceTable:
                 listed = ", ".join(map(str, labels[:5])) + (", ..." if len(labels) > 5 else "")
                 raise InputError(
                     f"{file}: column {name!r} is missing or not finite for {key} {listed} ({unusable.sum()} of "
-                    f"{len(self)} rows of {self.source}); correct the values, or remove these rows"
+                    f"{len(self)} rows of {self.source}); correct the values, or {remedy}"
                 )
             rows = ", ".join(map(str, self.row[unusable][:5])) + (", ..." if unusable.sum() > 5 else "")
             raise InputError(
                 f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} rows "
-                f"(row {rows}); correct the values, or remove these rows"
+                f"(row {rows}); correct the values, or {remedy}"
             )
         return numbers
 
