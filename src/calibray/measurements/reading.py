@@ -374,7 +374,7 @@ def _areas(
         # Stretches of equal distance along each track, in the order of its rows.
         steps = pd.DataFrame(positions).groupby(apart).diff().fillna(0.0)
         travelled = pd.Series(np.linalg.norm(steps, axis=1)).groupby(apart).cumsum()
-        return np.floor(travelled / averaging.size).to_numpy(dtype=np.int64)
+        return np.floor(travelled.to_numpy() / averaging.size).astype(np.int64)
     cells = np.floor(positions / averaging.size).astype(np.int64)
     return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
 
