@@ -166,6 +166,16 @@ def test_parquet_reads_like_csv(tmp_path):
         read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
 
 
+def test_named_levels_of_the_index_of_a_parquet_file_are_columns(tmp_path):
+    path, table = tmp_path / "links.parquet", pd.DataFrame({"cell": ["a", "b"], "time": [7, 9], "x": [1.0, 2.0]})
+    for indexed in (table.set_index("time"), table.set_index(["cell", "time"]), table.iloc[::-1], table):
+        indexed.to_parquet(path)
+        for read in (read_table(path), *PiecedTable.open(path).pieces(10)):
+            pd.testing.assert_frame_equal(
+                read.frame.sort_values("time", ignore_index=True), table, check_like=True
+            )
+
+
 def test_decimal_numbers_of_a_database_are_numbers(tmp_path):
     path, values = tmp_path / "links.parquet", [Decimal("1.25"), None, Decimal("-70.50")]
     pd.DataFrame({"x": values, "cell": [Decimal(5), Decimal(7), Decimal(5)]}).to_parquet(path)

@@ -311,7 +311,7 @@ def _read_parquet(path: Path) -> SourceTable:
         frame = _without_decimals(pd.read_parquet(path, engine="pyarrow"))
     except Exception as error:
         raise _damaged(path, error) from None
-    return SourceTable(frame.reset_index(drop=True), source=str(path))
+    return SourceTable(with_index_columns(frame), source=str(path))
 
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
@@ -386,9 +386,23 @@ def _open_parquet(path: Path) -> Any:
 def _next_frame(path: Path, batches: Iterator[Any]) -> Any:
     try:
         batch = next(batches, None)
-        return None if batch is None else _without_decimals(batch.to_pandas().reset_index(drop=True))
+        return None if batch is None else _without_decimals(with_index_columns(batch.to_pandas()))
     except Exception as error:
         raise _damaged(path, error) from None
+
+
+def with_index_columns(frame: pd.DataFrame) -> pd.DataFrame:
+    """A table whose named index levels are columns and whose rows are numbered; unnamed levels are dropped.
+
+    Example:
+        >>> with_index_columns(pd.DataFrame({"time": [7, 9], "x": [1.0, 2.0]}).set_index("time"))
+           time    x
+        0     7  1.0
+        1     9  2.0
+    """
+    named = [name for name in frame.index.names if name is not None and name not in frame]
+    rows = frame.reset_index(drop=True)
+    return pd.concat([frame.index.to_frame(index=False)[named], rows], axis=1) if named else rows
 
 
 def _without_decimals(frame: pd.DataFrame) -> pd.DataFrame:

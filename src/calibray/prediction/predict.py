@@ -19,6 +19,7 @@ from calibray.engines.protocol import Answering, Engine
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
+from calibray.measurements.table_files import with_index_columns
 from calibray.parameters import fixed_constant, split_name
 from calibray.paths import take_links
 from calibray.prediction.corrections import (
@@ -120,7 +121,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
         if links.columns.has_duplicates:
             name = links.columns[links.columns.duplicated()][0]
             raise InputError(f"links: has several columns {name!r}; keep one")
-        links = SourceTable(links.reset_index(drop=True).infer_objects(), source="links")
+        links = SourceTable(with_index_columns(links).infer_objects(), source="links")
     if not isinstance(links, SourceTable):
         raise InputError(
             f"links: is a {type_name(links)}, must be a pandas DataFrame, such as pandas.read_csv(file) for a file, or "
