@@ -64,6 +64,8 @@ def test_received_power_is_predicted_in_the_measured_quantity(received):
     ends = predictions[reached]
     assert (ends.received_power_lower_dbm < ends.received_power_dbm).all()
     assert ends.received_power_upper_dbm.to_numpy() == pytest.approx(33.0 - ends.lower_db.to_numpy())
+    some = table[table.index != 1][::-1]
+    pd.testing.assert_frame_equal(received.predict_interval(some), predictions.loc[some.index])
     # Without the power there is path loss alone.
     assert "received_power_dbm" not in received.predict_interval(planted.links())
     assert predictions.remark[planted.INSIDE] == "receiver inside a building"

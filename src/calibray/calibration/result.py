@@ -122,9 +122,9 @@ class Result(Record):
             allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            One row per link: path_loss_db, lower_db and upper_db [dB]; the same three in the measured quantity if that
-            is not path loss; basis, the source of the interval; and remark, a warning about an unlikely antenna
-            position.
+            One row per link, with the index of the table: path_loss_db, lower_db and upper_db [dB]; the same three in
+            the measured quantity if that is not path loss; basis, the source of the interval; and remark, a warning
+            about an unlikely antenna position.
 
         Raises:
             InputError: An error of `predict` other than an unknown group; the level is not between 0 and 1; or the

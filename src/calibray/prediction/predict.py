@@ -105,7 +105,10 @@ def predict_interval(
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     refuse_far_links(result, setup.links, read_triangles(setup.scene))
     table = interval(result, setup, level, progress)
-    return add_remarks(result, setup, table.assign(**as_measured(result.study, setup.links, table)))
+    table = add_remarks(result, setup, table.assign(**as_measured(result.study, setup.links, table)))
+    # pandas assigns columns by index, so the columns of a sorted or filtered table need its index.
+    is_by_row = isinstance(links, pd.DataFrame) and len(links) == len(table)
+    return table.set_axis(links.index, axis="index") if is_by_row else table
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
