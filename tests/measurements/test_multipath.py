@@ -104,6 +104,20 @@ def test_delays_and_levels_of_another_unit_or_sign_are_refused(tmp_path, columns
         read_multipath(tmp_path / "multipath.csv", "id")
 
 
+def test_of_several_levels_or_delays_the_plain_one_is_used_and_doubt_is_refused(tmp_path):
+    # Constants instead of the columns of the table, so that a wrong choice changes the spread.
+    for other in ("noise_power_dbm", "tx_power_dbm", "delay_bin", "gain"):
+        table = TABLE.copy()
+        table.insert(0, other, [-100.0, -50.0, -100.0, -50.0, -100.0])
+        table.to_csv(tmp_path / "multipath.csv", index=False)
+        paths = read_multipath(tmp_path / "multipath.csv", "id")
+        assert values(paths, "rms_delay_spread")["7"] == pytest.approx(75e-9)
+    for other in ("total path loss [dB]", "first_delay_ns"):
+        TABLE.assign(**{other: 75.0}).to_csv(tmp_path / "multipath.csv", index=False)
+        with pytest.raises(InputError, match=rf"can all contain the (level|delay).*keep one"):
+            read_multipath(tmp_path / "multipath.csv", "id")
+
+
 def test_angles_are_those_of_the_end(tmp_path):
     table = TABLE.rename(columns={"azimuth_deg": "aoa_deg"})
     table.insert(0, "tx_power_dbm", [-60.0, -20.0, -20.0, -20.0, -20.0])

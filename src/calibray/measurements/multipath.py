@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,8 +81,8 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         compass: Whether azimuths are compass bearings, clockwise from north.
 
     Raises:
-        InputError: The table cannot be read, or has no column of links, delays or powers. Delays or powers do not match
-            the unit or sign that the column names imply.
+        InputError: The table cannot be read, has no column of links, delays or powers, or several columns of delays or
+            powers. Delays or powers do not match the unit or sign that the column names imply.
     """
     table = read_table(path)
     # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
@@ -92,12 +92,22 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         if name != link
     }
 
-    def find(pattern: str, other: str = "spread") -> str | None:
-        return next(
-            (name for name, plain in names.items() if re.search(pattern, plain) and other not in plain), None
-        )
+    def find(what: str, pattern: str, other: str, units: Collection[str]) -> str | None:
+        found = [name for name, plain in names.items() if re.search(pattern, plain) and other not in plain]
+        # Of several columns, one that contains another quantity or states no unit is not meant.
+        if len(found) > 1:
+            found = [name for name in found if not matches(name, "another quantity")] or found
+        if len(found) > 1:
+            found = [name for name in found if words(name) & set(units)] or found
+        if len(found) > 1:
+            raise InputError(
+                f"{path}: the columns {shortened(', '.join(found), 300)} can all contain the {what} of the components; "
+                "keep one, and remove or rename the others"
+            )
+        return found[0] if found else None
 
-    delay, power, snapshot = find(DELAY), find(POWER, "tx"), find(SNAPSHOT)
+    delay, power = find("delay", DELAY, "spread", SECONDS), find("level", POWER, "tx", {"db", "dbm"})
+    snapshot = next((name for name, plain in names.items() if re.search(SNAPSHOT, plain)), None)
     if delay is None or power is None:
         missing = (
             "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
