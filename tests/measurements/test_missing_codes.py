@@ -53,6 +53,18 @@ def test_codes_of_a_wide_table_are_empty_cells():
     assert long.changes == {"codes for missing values (100)": 2, "cells without a value": 2}
 
 
+def test_codes_of_observables_are_stated_or_far_from_all_values():
+    frame = pd.DataFrame({"rssi": -70.0, "k_db": ["25", "999", "-1"], "ds": [5, 9, -999], "tof_ns": [50, 60, -1]})
+    steps = Preparation(missing=(999.0,), observables=["k_db", "ds", "tof_ns"], flights=["tof_ns"])
+    rows = select_rows(SourceTable(frame), steps, "rssi")
+    assert rows.numbers("k_db", gaps=True).tolist() == pytest.approx([25.0, np.nan, -1.0], nan_ok=True)
+    assert rows.changes == {
+        "codes for missing values in k_db (999)": 1,
+        "codes for missing values in ds (-999)": 1,
+        "codes for missing values in tof_ns (-1)": 1,
+    }
+
+
 def test_further_codes_are_stated():
     frame = pd.DataFrame({"x": [10.0, 20.0, 30.0], "rssi": [-70.0, -110.0, -101.0]})
     links = measured_links(SourceTable(frame), COLUMNS, Preparation(missing=(-110.0,)))

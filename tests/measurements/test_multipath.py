@@ -118,6 +118,22 @@ def test_of_several_levels_or_delays_the_plain_one_is_used_and_doubt_is_refused(
             read_multipath(tmp_path / "multipath.csv", "id")
 
 
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [("path_loss_db", 0.0), ("path_loss_db", 999.0), ("path_loss_db", -999.0), ("delay_ns", -999.0)],
+)
+def test_codes_among_components_are_refused_unless_the_study_states_them(tmp_path, name, code):
+    table = pd.concat([TABLE, TABLE.head(1).assign(**{name: code})])
+    table.to_csv(tmp_path / "multipath.csv", index=False)
+    with pytest.raises(InputError, match=rf"multipath\.csv, row 7, column '{name}': {code:g} .*links\.missing"):
+        read_multipath(tmp_path / "multipath.csv", "id")
+    paths = read_multipath(tmp_path / "multipath.csv", "id", missing=[code])
+    assert values(paths, "rms_delay_spread") == pytest.approx({"7": 75e-9, "9": 0.0})
+    # Relative to the strongest component, 0 dB is a level.
+    TABLE.assign(path_loss_db=[0.0, 25.0, 0.0, 30.0, 0.0]).to_csv(tmp_path / "multipath.csv", index=False)
+    assert len(read_multipath(tmp_path / "multipath.csv", "id").delay) == 5
+
+
 def test_angles_are_those_of_the_end(tmp_path):
     table = TABLE.rename(columns={"azimuth_deg": "aoa_deg"})
     table.insert(0, "tx_power_dbm", [-60.0, -20.0, -20.0, -20.0, -20.0])

@@ -127,14 +127,15 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             if section.kind not in SIGNED and len(wrong := np.flatnonzero(measured < 0)):
                 raise InputError(
                     f"{links.table.cell(int(wrong[0]), str(section.column))}: {measured[wrong[0]]:g}: a {section.kind} "
-                    f"must be at least 0 {section.unit}; correct it, or leave the cell empty"
+                    f"must be at least 0 {section.unit}; correct it, leave the cell empty, or state the code in links.missing"
                 )
             if section.kind in PROFILES:
                 measured = section.statistic.limited(measured)
         else:
             path = setup.study.observable_paths[name]
             labels = tuple(links.table.labels(section.id).tolist())
-            source = read(path, section.id, labels, section.compass, section.sample_rate, section.margin_db)
+            impulses = (section.sample_rate, section.margin_db)
+            source = read(path, section.id, labels, section.compass, impulses, setup.study.links.missing)
             values = measure(source, section.statistic)
             place = f"{path}"
             measured = np.array([values.get(label, np.nan) for label in labels]) / section.scale
@@ -158,11 +159,16 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
 
 
 def _read(
-    path: Path, label: str, links: tuple[str, ...], compass: bool, sample_rate: float | None, margin_db: float
+    path: Path,
+    label: str,
+    links: tuple[str, ...],
+    compass: bool,
+    impulses: tuple[float | None, float],
+    missing: tuple[float, ...],
 ) -> Multipath:
     if path.is_dir() or path.suffix.lower() in ENDINGS:
-        return read_impulse_responses(path, list(links), sample_rate, margin_db)
-    return read_multipath(path, label, compass)
+        return read_impulse_responses(path, list(links), *impulses)
+    return read_multipath(path, label, compass, missing)
 
 
 def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:

@@ -7,9 +7,10 @@ Impulse responses are converted to components: the samples above a threshold.
 
 from __future__ import annotations
 
+import logging
 import re
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,8 +26,12 @@ from calibray.errors import InputError
 from calibray.measurements import observables as kinds
 from calibray.measurements.column_names import matches, words
 from calibray.measurements.observables import Statistic
+from calibray.measurements.selection import LARGEST_LEVEL, find_codes
+from calibray.measurements.source_table import SourceTable
 from calibray.measurements.table_files import read_table
 from calibray.support.messages import shortened
+
+_LOG: Final = logging.getLogger(__name__)
 
 DELAY: Final = r"(^|_)(delay|tau|toa|tof)"
 POWER: Final = r"(^|_)(path_?loss|pl|path_?gain|gain|power|rx_?power|level)(_|$)"
@@ -43,6 +48,10 @@ SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 RADIANS: Final = frozenset({"rad", "radian", "radians"})
 """Words in a column name that indicate angles in radians instead of degrees."""
+
+LEAST_LOSS_DB: Final = 40.0
+"""Path loss of the free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is a code for a missing value if all other levels
+exceed this magnitude; levels relative to the strongest component contain 0 dB and smaller magnitudes."""
 
 LONGEST: Final = 0.01
 """Largest plausible delay [s]; light travels 3,000 km in this time."""
@@ -68,7 +77,9 @@ class Multipath:
     angles: Mapping[tuple[str, str], NDArray[np.float64]] = field(default_factory=dict)
 
 
-def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multipath:
+def read_multipath(
+    path: str | Path, link: str, compass: bool = False, missing: Sequence[float] = ()
+) -> Multipath:
     """Read a table with one row per multipath component.
 
     The columns are recognized by name: a delay (`delay_ns`), a path loss, path gain or power [dB] (`path_loss_db`),
@@ -79,10 +90,11 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         path: The table.
         link: Column of the link labels.
         compass: Whether azimuths are compass bearings, clockwise from north.
+        missing: Numbers that represent missing delays or levels; components with such a number are left out.
 
     Raises:
         InputError: The table cannot be read, has no column of links, delays or powers, or several columns of delays or
-            powers. Delays or powers do not match the unit or sign that the column names imply.
+            powers. Delays or powers do not match the unit or sign that the column names imply, or are not plausible.
     """
     table = read_table(path)
     # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
@@ -113,6 +125,10 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
         )
         raise InputError(f"{path}: no column with a {missing}; the columns are {', '.join(names)}")
+    coded = table.frame[[delay, power]].isin(list(missing)).any(axis=1).to_numpy()
+    if coded.any():
+        table = table.keep(~coded, "links.missing")
+        _LOG.info("%s: %d of %d components left out by links.missing", path, coded.sum(), len(coded))
     labels = table.labels(link)
     unit = next((unit for unit in SECONDS if unit in words(delay)), "s")
     seconds = table.numbers(delay) * SECONDS[unit]
@@ -129,6 +145,8 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
             f"{path}: column {power!r} has values of about {median:g} dB; losses must be positive, and gains and "
             "powers negative; name the column path_loss_db or path_gain_db"
         )
+
+    _check_plausible(table, delay, power)
 
     angles = {}
     for plane, pattern in ANGLE.items():
@@ -156,6 +174,27 @@ def read_multipath(path: str | Path, link: str, compass: bool = False) -> Multip
         -level_db if is_loss else level_db,
         angles,
     )
+
+
+def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
+    """Refuse codes for missing values and impossible values among the delays and levels of components.
+
+    Raises:
+        InputError: A value is not plausible.
+    """
+    delays, level_db = table.numbers(delay), table.numbers(power)
+    early = np.isin(delays, find_codes(delays, np.inf)) | ("excess" in delay.lower())
+    nearest = np.abs(level_db[level_db != 0]).min(initial=np.inf)
+    codes = [code for code in find_codes(level_db) if code or nearest > LEAST_LOSS_DB]
+    wrong_level = np.isin(level_db, codes) | (np.abs(level_db) > LARGEST_LEVEL)
+    for name, values, wrong in ((delay, delays, early & (delays < 0)), (power, level_db, wrong_level)):
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            what = "delay" if name == delay else f"level (at most {LARGEST_LEVEL:g} dB in magnitude)"
+            raise InputError(
+                f"{table.cell(row, name)}: {values[row]:g} is not a plausible {what}, or is a code for a missing "
+                "value; correct it, remove the row, or add the number to links.missing"
+            )
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:

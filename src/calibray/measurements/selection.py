@@ -71,11 +71,18 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
                     f"{table.source}: column {value!r} contains no measured value; check links.missing"
                 )
             table = table.select(~coded)
-    for name in steps.flights:
-        if name in table.frame and (codes := find_codes(_numbers(table.frame[name]), np.inf)):
-            coded = table.frame[name].isin(codes)
-            cause = f"codes for missing values in {name} ({', '.join(f'{code:g}' for code in codes)})"
-            table = table.assign(**{name: table.frame[name].mask(coded)}).note(cause, int(coded.sum()))
+    for name in dict.fromkeys([*steps.flights, *steps.observables]):
+        if name not in table.frame:
+            continue
+        numbers = _numbers(table.frame[name])
+        # A K-factor of -1 dB is a value, but no observable other than a time has large values of both signs.
+        smallest = 0.0 if name in steps.flights else LARGEST_LEVEL
+        found = [code for code in find_codes(numbers, np.inf) if abs(code) >= smallest]
+        coded = np.isin(numbers, [*found, *steps.missing])
+        if coded.any():
+            codes = ", ".join(f"{code:g}" for code in np.unique(numbers[coded]))
+            cause = f"codes for missing values in {name} ({codes})"
+            table = table.assign(**{name: table.frame[name].mask(coded)}).note(cause, coded.sum())
     if steps.transmitters is not None:
         table = _join_transmitters(table, steps.transmitters, steps.transmitter)
     if steps.check is not None:
