@@ -27,6 +27,8 @@ def read(tmp_path, text, name="log.csv", encoding="utf-8"):
         (PLAIN.replace(",", "   "), "log.dat", "utf-8"),
         ("  " + PLAIN.replace(",", " \t ").replace("\n", "  \n  "), "log.txt", "utf-8"),
         (PLAIN, "log.csv", "utf-16"),
+        (PLAIN, "log.csv", "utf-16-le"),
+        (PLAIN, "log.csv", "utf-16-be"),
         (SEMICOLONS, "log.csv", "utf-8-sig"),
         ("WigleWifi-1.4,appRelease=2.26\n" + PLAIN, "log.csv", "utf-8"),
         ("# logger 3\n# walk, 4 May\n#\n" + PLAIN, "log.csv", "utf-8"),
@@ -85,6 +87,7 @@ def test_a_table_in_windows_1252_is_read(tmp_path):
         (PLAIN.replace("-70.5", "dBm"), "'dBm' is not a number"),
         ("1,2,3\n4,5,6\n", "row 1: contains numbers; insert a line with the column names"),
         ("Logger\n" + PLAIN + "4,5,6\n", "cells, but the header has"),
+        ("PK\x03\x04" + PLAIN, "a ZIP archive or an Excel file; unpack it"),
     ],
 )
 def test_a_fault_is_refused_and_not_taken_for_a_layout(tmp_path, text, message):

@@ -54,17 +54,23 @@ class _Layout:
 
 
 def read_text(path: Path) -> str:
-    """Read the text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
+    """Read the text of a file in UTF-8, in UTF-16, or else in Windows-1252.
 
     Raises:
-        InputError: The file cannot be read or contains bytes that are not text.
+        InputError: The file cannot be read, is an archive or contains bytes that are not text.
     """
     try:
         raw = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    if raw.startswith(b"PK\x03\x04"):
+        raise InputError(f"{path}: a ZIP archive or an Excel file; unpack it, or name the Excel file .xlsx")
+    encoding = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    # Without a byte order mark, the zero bytes of the first letters indicate UTF-16 and its byte order.
+    if raw[:2].count(0) == raw[2:4].count(0) == 1:
+        encoding = "utf-16-be" if raw.startswith(b"\0") else "utf-16-le"
     try:
-        return raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        return raw.decode(encoding)
     except UnicodeDecodeError as error:
         try:
             text = raw.decode("cp1252")
