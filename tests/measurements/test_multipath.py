@@ -79,10 +79,15 @@ def test_components_at_the_end_of_a_bin_or_window_are_on_it_in_spite_of_rounding
         assert values(paths, "mean_excess_delay", window=1e-8)["a"] == pytest.approx(5e-9)
 
 
-@pytest.mark.parametrize("name", ["delay_ns", "Delay (ns)", "TOA [ns]", "delayNs"])
-def test_the_unit_of_delays_is_that_of_their_name(tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [("delay_ns", 1.0), ("Delay (ns)", 1.0), ("TOA [ns]", 1.0), ("delayNs", 1.0), ("delay_ps", 1e3)],
+)
+def test_the_unit_of_delays_is_that_of_their_name(tmp_path, name, factor):
     columns = {"delay_ns": name}
-    TABLE.rename(columns=columns).to_csv(tmp_path / "multipath.csv", index=False)
+    TABLE.assign(delay_ns=TABLE["delay_ns"] * factor).rename(columns=columns).to_csv(
+        tmp_path / "multipath.csv", index=False
+    )
     assert values(read_multipath(tmp_path / "multipath.csv", "id"), "rms_delay_spread")["7"] == pytest.approx(
         75e-9
     )
@@ -125,7 +130,9 @@ def test_of_several_levels_or_delays_the_plain_one_is_used_and_doubt_is_refused(
 def test_codes_among_components_are_refused_unless_the_study_states_them(tmp_path, name, code):
     table = pd.concat([TABLE, TABLE.head(1).assign(**{name: code})])
     table.to_csv(tmp_path / "multipath.csv", index=False)
-    with pytest.raises(InputError, match=rf"multipath\.csv, row 7, column '{name}': {code:g} .*links\.missing"):
+    with pytest.raises(
+        InputError, match=rf"multipath\.csv, row 7, column '{name}': {code:g} .*links\.missing"
+    ):
         read_multipath(tmp_path / "multipath.csv", "id")
     paths = read_multipath(tmp_path / "multipath.csv", "id", missing=[code])
     assert values(paths, "rms_delay_spread") == pytest.approx({"7": 75e-9, "9": 0.0})

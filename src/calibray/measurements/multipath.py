@@ -44,7 +44,7 @@ SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_
 ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
 """Kinds of statistics that need angles."""
 
-SECONDS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+SECONDS: Final = {"ps": 1e-12, "ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 RADIANS: Final = frozenset({"rad", "radian", "radians"})
 """Words in a column name that indicate angles in radians instead of degrees."""
