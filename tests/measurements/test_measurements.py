@@ -167,7 +167,10 @@ def test_parquet_reads_like_csv(tmp_path):
 
 
 def test_named_levels_of_the_index_of_a_parquet_file_are_columns(tmp_path):
-    path, table = tmp_path / "links.parquet", pd.DataFrame({"cell": ["a", "b"], "time": [7, 9], "x": [1.0, 2.0]})
+    path, table = (
+        tmp_path / "links.parquet",
+        pd.DataFrame({"cell": ["a", "b"], "time": [7, 9], "x": [1.0, 2.0]}),
+    )
     for indexed in (table.set_index("time"), table.set_index(["cell", "time"]), table.iloc[::-1], table):
         indexed.to_parquet(path)
         for read in (read_table(path), *PiecedTable.open(path).pieces(10)):

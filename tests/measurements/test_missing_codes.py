@@ -47,14 +47,17 @@ def test_codes_are_below_the_noise_floor():
 
 
 def test_codes_of_a_wide_table_are_empty_cells():
-    wide = pd.DataFrame({"x": [0.0, 5.0], "ap1": [-40, 100], "ap2": [100, -61]})
-    long = select_rows(SourceTable(wide), Preparation({"ap1": "1", "ap2": "2"}), "rssi")
-    assert long.frame["rssi"].tolist() == [-40.0, -61.0]
-    assert long.changes == {"codes for missing values (100)": 2, "cells without a value": 2}
+    wide = pd.DataFrame({"x": [0.0, 5.0], "ap1": [-40, 100], "ap2": [100, -61], "ap3": [np.nan, -62]})
+    long = select_rows(SourceTable(wide), Preparation({"ap1": "1", "ap2": "2", "ap3": "3"}), "rssi")
+    assert long.frame["rssi"].tolist() == [-40.0, -61.0, -62.0]
+    # A code is counted once, as a code.
+    assert long.changes == {"codes for missing values (100)": 2, "cells without a value": 1}
 
 
 def test_codes_of_observables_are_stated_or_far_from_all_values():
-    frame = pd.DataFrame({"rssi": -70.0, "k_db": ["25", "999", "-1"], "ds": [5, 9, -999], "tof_ns": [50, 60, -1]})
+    frame = pd.DataFrame(
+        {"rssi": -70.0, "k_db": ["25", "999", "-1"], "ds": [5, 9, -999], "tof_ns": [50, 60, -1]}
+    )
     steps = Preparation(missing=(999.0,), observables=["k_db", "ds", "tof_ns"], flights=["tof_ns"])
     rows = select_rows(SourceTable(frame), steps, "rssi")
     assert rows.numbers("k_db", gaps=True).tolist() == pytest.approx([25.0, np.nan, -1.0], nan_ok=True)

@@ -45,8 +45,10 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
     """Apply the steps of `select_rows` that choose rows: `wide`, `track` and `where`."""
     if steps.wide:
+        counted = sum(table.changes.values())
         table, _ = mask_codes(table, list(steps.wide), steps.missing)
-        table = melt(table, steps.wide, value, steps.transmitter)
+        coded = sum(table.changes.values()) - counted
+        table = melt(table, steps.wide, value, steps.transmitter, coded=coded)
     if steps.track is not None:
         table = join_track(table, steps.track)
     if steps.where is not None:
@@ -96,12 +98,18 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
 
 
 def melt(
-    table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
+    table: SourceTable,
+    columns: Mapping[str, str],
+    value: str,
+    transmitter: str,
+    *,
+    keep_empty: bool = False,
+    coded: int = 0,
 ) -> SourceTable:
     """Convert a table with one column per transmitter to one row per link. Links from one row stay together.
 
     `value` and `transmitter` are the names of the new columns. With `keep_empty`, cells without a value also become
-    links, as required for prediction.
+    links, as required for prediction. `coded` is the number of empty cells that contained codes and are already counted.
 
     Raises:
         InputError: A column is missing, not numeric or has the name of a new column, or no cell has a value.
@@ -124,7 +132,7 @@ def melt(
     frame[transmitter] = np.array(list(columns.values()))[column]
     frame[value] = values[row, column]
     long = replace(table, frame=frame, row=table.row[row])
-    empty = values.size - len(row)
+    empty = values.size - len(row) - coded
     return long.note("cells without a value", empty) if empty else long
 
 
