@@ -119,7 +119,7 @@ def test_of_several_levels_or_delays_the_plain_one_is_used_and_doubt_is_refused(
         assert values(paths, "rms_delay_spread")["7"] == pytest.approx(75e-9)
     for other in ("total path loss [dB]", "first_delay_ns"):
         TABLE.assign(**{other: 75.0}).to_csv(tmp_path / "multipath.csv", index=False)
-        with pytest.raises(InputError, match=rf"can all contain the (level|delay).*keep one"):
+        with pytest.raises(InputError, match=r"can all contain the (level|delay).*keep one"):
             read_multipath(tmp_path / "multipath.csv", "id")
 
 

@@ -127,7 +127,8 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
             if section.kind not in SIGNED and len(wrong := np.flatnonzero(measured < 0)):
                 raise InputError(
                     f"{links.table.cell(int(wrong[0]), str(section.column))}: {measured[wrong[0]]:g}: a {section.kind} "
-                    f"must be at least 0 {section.unit}; correct it, leave the cell empty, or state the code in links.missing"
+                    f"must be at least 0 {section.unit}; correct it, leave the cell empty, or add the number to "
+                    "links.missing"
                 )
             if section.kind in PROFILES:
                 measured = section.statistic.limited(measured)

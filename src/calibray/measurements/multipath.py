@@ -50,7 +50,7 @@ RADIANS: Final = frozenset({"rad", "radian", "radians"})
 """Words in a column name that indicate angles in radians instead of degrees."""
 
 LEAST_LOSS_DB: Final = 40.0
-"""Path loss of the free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is a code for a missing value if all other levels
+"""Path loss in free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is a code for a missing value if all other levels
 exceed this magnitude; levels relative to the strongest component contain 0 dB and smaller magnitudes."""
 
 LONGEST: Final = 0.01
@@ -121,10 +121,8 @@ def read_multipath(
     delay, power = find("delay", DELAY, "spread", SECONDS), find("level", POWER, "tx", {"db", "dbm"})
     snapshot = next((name for name, plain in names.items() if re.search(SNAPSHOT, plain)), None)
     if delay is None or power is None:
-        missing = (
-            "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
-        )
-        raise InputError(f"{path}: no column with a {missing}; the columns are {', '.join(names)}")
+        wanted = "delay, such as delay_ns" if delay is None else "power, such as path_loss_db or path_gain_db"
+        raise InputError(f"{path}: no column with a {wanted}; the columns are {', '.join(names)}")
     coded = table.frame[[delay, power]].isin(list(missing)).any(axis=1).to_numpy()
     if coded.any():
         table = table.keep(~coded, "links.missing")

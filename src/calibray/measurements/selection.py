@@ -109,7 +109,7 @@ def melt(
     """Convert a table with one column per transmitter to one row per link. Links from one row stay together.
 
     `value` and `transmitter` are the names of the new columns. With `keep_empty`, cells without a value also become
-    links, as required for prediction. `coded` is the number of empty cells that contained codes and are already counted.
+    links, as required for prediction. `coded` is the number of empty cells that contained codes and are counted.
 
     Raises:
         InputError: A column is missing, not numeric or has the name of a new column, or no cell has a value.

@@ -107,8 +107,9 @@ def predict_interval(
     table = interval(result, setup, level, progress)
     table = add_remarks(result, setup, table.assign(**as_measured(result.study, setup.links, table)))
     # pandas assigns columns by index, so the columns of a sorted or filtered table need its index.
-    is_by_row = isinstance(links, pd.DataFrame) and len(links) == len(table)
-    return table.set_axis(links.index, axis="index") if is_by_row else table
+    if isinstance(links, pd.DataFrame) and len(links) == len(table):
+        return table.set_axis(links.index, axis="index")
+    return table
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
