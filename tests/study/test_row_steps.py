@@ -361,7 +361,8 @@ def test_numeric_columns_that_a_study_uses_are_means_of_the_rows_of_a_link(tmp_p
     pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
     section = {"file": "log.csv", "tx": [0.0, 0.0, 9.0], "rx": ["x", 0.0, 1.5], "value": "loss", "std": 2.0}
     content = STUDY | {
-        "links": section | {"position_error_m": "gps_m"} | links,
+        # A number that marks missing measurements can be a value of another column.
+        "links": section | {"position_error_m": "gps_m", "missing": [0.0]} | links,
         "nuisance": {
             "load": {"by": "load"},
             "x": {"by": "x"},

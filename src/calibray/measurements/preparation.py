@@ -139,7 +139,9 @@ class Preparation:
         keep: Columns whose labels define groups that are averaged separately, in addition to the transmitter column.
         held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
             merged across parts.
-        observables: Columns of additional numbers, such as delays, which are averaged over the rows of a link.
+        observables: Columns of additional measured values, such as delays, which are averaged over the rows of a link.
+            Codes for missing values in them count as missing.
+        means: Columns of other numbers that are averaged over the rows of a link, such as those of nuisances.
         flights: Columns of times of flight, in which certain numbers can represent missing values.
         computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
             been added. A function returns None if an optional column that it requires is missing.
@@ -165,6 +167,7 @@ class Preparation:
     keep: Sequence[str] = ()
     held_out: Divide | None = None
     observables: Sequence[str] = ()
+    means: Sequence[str] = ()
     flights: Sequence[str] = ()
     computed: Mapping[str, Compute] = field(default_factory=dict)
     check: Callable[[SourceTable], None] | None = None

@@ -337,7 +337,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     table = _note_steps(table, group, level, samples["below"].to_numpy() == 0, keys)
 
     # `std_db` and `count` are computed for the averages, so they are not columns of the samples.
-    stated = {columns.weight, columns.std, *steps.observables} - {"std_db", "count"}
+    stated = {columns.weight, columns.std, *steps.observables, *steps.means} - {"std_db", "count"}
     numeric = [str(name) for name in stated if name in table.frame]
     averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
         **{columns.value: sign * mean_level},
@@ -405,14 +405,14 @@ resolution of a millimetre at best, and coordinate conversions differ by microme
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of each link into the first row, with the means of linear power, weights and further observables.
+    """Merge the rows of each link into the first row, with the means of linear power, weights and other numbers.
 
     Rows belong to one link if their positions agree within `SAME_POSITION`, and the transmitter, kept columns, carrier
     frequency, transmitted power and times are equal. Rows at different times remain separate links. Rows below the
     noise floor are not merged with rows above the floor, and held-out rows are not merged with other rows. Receivers
     inside buildings are moved after merging, because two positions can be moved to the same corner. The steps `keep`,
-    `held_out`, `observables`, `transmitter`, `noise_floor_dbm` and `averaging` are used. After averaging, the table is
-    unchanged, because no repeats remain.
+    `held_out`, `observables`, `means`, `transmitter`, `noise_floor_dbm` and `averaging` are used. After averaging, the
+    table is unchanged, because no repeats remain.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -449,7 +449,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     for name in (columns.weight, columns.std):
         if isinstance(name, str):
             merged[name] = pd.Series(table.numbers(name)).groupby(link).mean().to_numpy()
-    for name in [name for name in steps.observables if name in table.frame]:
+    for name in [name for name in (*steps.observables, *steps.means) if name in table.frame]:
         merged[name] = _means(table, name, link)
     table = table.note("rows that repeat a link, merged", int((~first).sum()))
     return _note_steps(table, link, level, value > floor, list(map(str, keys))).select(first).assign(**merged)

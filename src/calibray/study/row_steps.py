@@ -110,8 +110,8 @@ def row_steps(study: StudyModel) -> Preparation:
         observables=[
             *(item.column for item in study.observables.values() if item.column is not None),
             *filtered,
-            *sorted(name for name in means - others if isinstance(name, str)),
         ],
+        means=sorted(name for name in means - others if isinstance(name, str)),
         flights=[item.column for item in study.observables.values() if item.column and item.kind in FLIGHTS],
         computed=filtered | ({PORT_POWER: partial(port_power, study)} if states_port_power(study) else {}),
         check=partial(check_mounting_columns, study),
