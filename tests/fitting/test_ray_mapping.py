@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -419,18 +420,22 @@ def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
         assert not missed.understood
 
 
-def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: Foreign) -> None:
-    """It lacks both paths of the first link after its first call."""
+def losing(foreign: Foreign, link: int, complete: int) -> Callable[[np.ndarray], Export]:
+    """The engine without the paths of a link, except in its first `complete` calls."""
     calls = 0
 
     def ask(candidate: np.ndarray) -> Export:
         nonlocal calls
         calls += 1
-        table = foreign.rays(candidate)
-        kept = np.flatnonzero(foreign.paths.link > 0) if calls > 1 else np.arange(len(table.path))
-        return Export.of_table(table.take(kept), RaySetting.of(foreign.problem.setup))
+        kept = np.flatnonzero((foreign.paths.link != link) | (calls <= complete))
+        return Export.of_table(foreign.rays(candidate).take(kept), RaySetting.of(foreign.problem.setup))
 
-    mapped = map_rays(foreign.problem, ask, most_calls=3)
+    return ask
+
+
+def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: Foreign) -> None:
+    """It lacks both paths of the first link after its first call."""
+    mapped = map_rays(foreign.problem, losing(foreign, link=0, complete=1), most_calls=3)
     assert mapped.understanding.misfit_db < 0.2
     assert mapped.gap_db < 0.05
     assert (mapped.changed, mapped.lost) == (2, 1)
@@ -440,17 +445,8 @@ def test_an_engine_whose_strong_paths_come_and_go_is_not_understood(foreign: For
 
 def test_a_link_that_loses_its_paths_at_the_minimum_ends_the_calls_and_is_named(foreign: Foreign) -> None:
     """The objective is infinite there, so further calls at the minimum would be useless."""
-    calls = 0
-
-    def ask(candidate: np.ndarray) -> Export:
-        nonlocal calls
-        calls += 1
-        table = foreign.rays(candidate)
-        kept = np.flatnonzero(foreign.paths.link != 1) if calls > 2 else np.arange(len(table.path))
-        return Export.of_table(table.take(kept), RaySetting.of(foreign.problem.setup))
-
-    mapped = map_rays(foreign.problem, ask)
-    assert calls == len(mapped.calls) == 4
+    mapped = map_rays(foreign.problem, losing(foreign, link=1, complete=2))
+    assert len(mapped.calls) == 4
     row = foreign.problem.setup.links.row[1]
     text = remark_text(ray_mapping._remark(mapped, foreign.problem))
     assert f"1 link has no path in some of the calls (row {row})" in text

@@ -88,10 +88,7 @@ def suspicious_rows(
     yield "without a path", str(len(without_path)), text + treatment if text else ""
     if enclosed is None:
         return
-    for end, rows, below in (
-        ("transmitter", enclosed.tx, enclosed.tx_below),
-        ("receiver", enclosed.rx, enclosed.rx_below),
-    ):
+    for end, rows, below in enclosed.ends:
         if enclosed.indoors:
             remedy = "like most receivers: the scene is assumed to be indoors"
         else:

@@ -198,10 +198,7 @@ def _cautions(result: Record) -> Iterator[Sentence]:
         sentences.append(f"{len(without_path):,} of {count} {verb} no path ({rows_text(without_path)}).")
     enclosed = result.provenance.enclosed
     if enclosed is not None:
-        for end, rows, below in (
-            ("transmitter", enclosed.tx, enclosed.tx_below),
-            ("receiver", enclosed.rx, enclosed.rx_below),
-        ):
+        for end, rows, below in enclosed.ends:
             if rows and not enclosed.indoors:
                 sentences.append(
                     f"The {end} is inside a building in {rows_text(list(rows))}: check the positions."

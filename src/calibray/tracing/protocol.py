@@ -242,6 +242,11 @@ class EnclosedAntennas:
     tx_below: tuple[int, ...] = ()
     rx_below: tuple[int, ...] = ()
 
+    @property
+    def ends(self) -> tuple[tuple[str, tuple[int, ...], tuple[int, ...]], ...]:
+        """Name of each end of the links, with its rows inside a body and below the ground."""
+        return ("transmitter", self.tx, self.tx_below), ("receiver", self.rx, self.rx_below)
+
     @classmethod
     def of(
         cls,
