@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import pty
 import re
@@ -16,17 +15,14 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
 import programs
 from calibray import calibrate
 from calibray.cli.app import app
-from calibray.cli.console import progress_bars
 from calibray.engines import open_ledger
 from calibray.errors import EngineError
 from calibray.study import Study
-from calibray.support import interruption
 from commands import write_study
 
 # Its standard input becomes the controlling terminal. A background job inherits that Ctrl-C is ignored: reset.
@@ -81,23 +77,6 @@ def in_terminal(words: list[object], out: Path, until: int) -> tuple[int, str]:
     finally:
         process.kill()
         os.close(own)
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_an_interruption_that_a_library_drops_is_raised_at_the_next_report(terminal, monkeypatch):
-    monkeypatch.setattr(interruption, "GRACE", 0.0)
-    console = Console(file=io.StringIO(), force_terminal=terminal)
-
-    def work():
-        with progress_bars(console) as progress:
-            progress("tracing", 0, 2)
-            with contextlib.suppress(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-            progress("tracing", 1, 2)
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_an_import_that_dropped_ctrl_c_interrupts_a_calibration(monkeypatch, tmp_path):

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import time
+from importlib import _bootstrap_external as bootstrap_external
+from importlib.machinery import ExtensionFileLoader
+from types import ModuleType
 
 import pytest
 
@@ -56,18 +60,90 @@ def test_an_error_after_ctrl_c_is_an_interruption(pressed):
         work()
 
 
-def test_an_interruption_that_a_library_dropped_is_raised_after_the_time_of_grace(monkeypatch):
-    def work(grace):
-        monkeypatch.setattr(interruption, "GRACE", grace)
-        with interruption.ensure_interruption():
-            with contextlib.suppress(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
-            interruption.raise_pending_interruption()
+def _drop():
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
 
-    work(grace=1000.0)
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_that_a_library_dropped_is_raised_again(number):
+    def work():
+        with interruption.interrupt_on_termination(), interruption.ensure_interruption():
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(number)
+            time.sleep(60)
+
     with pytest.raises(KeyboardInterrupt):
-        work(grace=0.0)
+        work()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
+
+
+def test_an_interruption_is_not_raised_again_while_it_is_handled():
+    saved = []
+
+    def work():
+        with interruption.ensure_interruption():
+            try:
+                signal.raise_signal(signal.SIGINT)
+            finally:
+                for call in range(3):
+                    time.sleep(1.5 * interruption.INTERVAL)
+                    saved.append(call)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert saved == [0, 1, 2]
+
+
+def test_an_acknowledged_interruption_is_not_raised_again():
+    with interruption.ensure_interruption():
+        _drop()
+        interruption.acknowledge_interruption()
+        time.sleep(2 * interruption.INTERVAL)
+
+
+def test_a_dropped_interruption_does_not_outlast_its_block():
+    with interruption.ensure_interruption():
+        _drop()
+    time.sleep(2 * interruption.INTERVAL)
+
+
+def test_an_alarm_of_the_caller_is_left_alone():
+    alarms = []
+    handler = signal.signal(signal.SIGALRM, lambda *_: alarms.append(1))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+        with interruption.ensure_interruption():
+            _drop()
+            time.sleep(0.1)
+    finally:
+        signal.signal(signal.SIGALRM, handler)
+    assert alarms == [1]
+
+
+def test_ctrl_c_waits_until_a_compiled_module_is_initialized(monkeypatch):
+    """An exception inside its initialization aborts the process."""
+    events = []
+
+    def initialize(*_):
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(2 * interruption.INTERVAL)
+        events.append("initialized")
+
+    # A module of the loader of compiled modules whose C function is replaced.
+    loader = ExtensionFileLoader("compiled", "compiled.so")
+    monkeypatch.setattr(bootstrap_external._imp, "exec_dynamic", initialize)
+
+    def work():
+        with interruption.ensure_interruption():
+            loader.exec_module(ModuleType("compiled"))
+            time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert events == ["initialized"]
 
 
 def test_a_deferred_interruption_waits_for_the_end_of_the_block():

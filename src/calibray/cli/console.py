@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, wraps
 from inspect import Parameter, Signature, signature
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 import typer
 
 from calibray.errors import InputError
-from calibray.support import interruption
 from calibray.support.progress import Progress
 
 if TYPE_CHECKING:
@@ -169,20 +168,13 @@ STARTING: Final = "starting"
 """The stage shown until the work reports its first stage, for example during imports."""
 
 
-@contextmanager
-def progress_bars(console: Console, every: float | None = None) -> Iterator[Progress]:
+def progress_bars(console: Console, every: float | None = None) -> AbstractContextManager[Progress]:
     """Show progress by stage: bars on a terminal, otherwise lines at least `every` seconds apart.
 
-    Yields a function of the stage, the amount done and the total (None if unknown).
+    Returns:
+        A context manager; its value is a function of the stage, the amount done and the total (None if unknown).
     """
-    display = _bars(console) if console.is_terminal else _lines(console, every or LINE_INTERVAL)
-    with display as report, interruption.ensure_interruption():
-
-        def progress(stage: str, done: int, total: int | None) -> None:
-            interruption.raise_pending_interruption()
-            report(stage, done, total)
-
-        yield progress
+    return _bars(console) if console.is_terminal else _lines(console, every or LINE_INTERVAL)
 
 
 @contextmanager

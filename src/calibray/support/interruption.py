@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Final
 
@@ -16,8 +17,12 @@ INTERRUPTED: Final = 128 + signal.SIGINT
 TERMINATED: Final = 128 + signal.SIGTERM
 """Exit status after SIGTERM, which schedulers and `timeout` send."""
 
-GRACE: Final = 1.0
-"""Time for an interruption to reach the code that saves results, before the interruption is raised again [s]."""
+INTERVAL: Final = 0.2
+"""Time after which a dropped interruption is raised again [s]; any value that a user does not notice would do."""
+
+
+Handler = Callable[[int, FrameType | None], None]
+"""Handler of a signal: a function of its number and of the interrupted frame."""
 
 
 @contextmanager
@@ -49,9 +54,8 @@ def unwrap_interruption() -> Iterator[None]:
 def ensure_interruption() -> Iterator[None]:
     """Ensure that Ctrl-C ends the block, even if a library handles or drops the interruption.
 
-    Compiled code can drop an interruption that occurs in its callbacks, or raise another error. Within this context,
-    `raise_pending_interruption` raises a dropped interruption again, and any error after Ctrl-C is treated as an
-    interruption.
+    Compiled code can drop an interruption that occurs in its callbacks, or raise another error. Within this context, a
+    dropped interruption is raised again, and any error after Ctrl-C is treated as an interruption.
 
     Yields:
         Nothing. Outside the main thread, or if another handler for Ctrl-C is set, the block runs unchanged.
@@ -60,44 +64,73 @@ def ensure_interruption() -> Iterator[None]:
         KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that followed, if any.
         Exception: The block raised this exception, and Ctrl-C was not pressed.
     """
-    handled = _has_handler(signal.SIGINT, signal.default_int_handler)
-    if handled:
-        _pressed.clear()
-        signal.signal(signal.SIGINT, _press)
+    with (
+        _handler(signal.SIGALRM, signal.SIG_DFL, _raise_again),
+        _handler(signal.SIGINT, signal.default_int_handler, _press),
+    ):
+        try:
+            yield
+        except Exception as error:
+            if _pressed:
+                raise KeyboardInterrupt from error
+            raise
+
+
+def acknowledge_interruption() -> None:
+    """Do not raise the interruption again: the caller has caught it, and raises it after saving results."""
+    if _pressed:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+# Whether Ctrl-C was pressed within `ensure_interruption`; global, because a process has one handler per signal.
+_pressed: list[int] = []
+
+
+@contextmanager
+def _handler(number: signal.Signals, default: object, handler: Handler) -> Iterator[None]:
+    """Handle a signal within the block, if this is the main thread and the signal has its default handler."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(number) is not default:
+        yield
+        return
+    _pressed.clear()
+    signal.signal(number, handler)
     try:
         yield
-    except Exception as error:
-        if _pressed:
-            raise KeyboardInterrupt from error
-        raise
     finally:
-        if handled:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            _pressed.clear()
+        acknowledge_interruption()
+        signal.signal(number, default)
+        _pressed.clear()
 
 
-def raise_pending_interruption() -> None:
-    """Raise again a KeyboardInterrupt that was dropped within `ensure_interruption`, after a grace period.
+def _press(number: int, frame: FrameType | None) -> None:
+    _pressed.append(number)
+    # A thread would be unsafe here: the interrupted code can hold the locks of the threading module.
+    if signal.getsignal(signal.SIGALRM) is _raise_again:
+        signal.setitimer(signal.ITIMER_REAL, INTERVAL, INTERVAL)
+        if _initializes_extension(frame):
+            return
+    raise KeyboardInterrupt
 
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed more than `GRACE` seconds ago, and the block is still running.
-    """
-    if _pressed and time.monotonic() - _pressed[-1] > GRACE:
+
+def _raise_again(_: int, frame: FrameType | None) -> None:
+    """Raise a dropped interruption again; one that is still being handled, for example to save results, was not."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    if error is None and not _initializes_extension(frame):
         raise KeyboardInterrupt
 
 
-# Times at which Ctrl-C was pressed within `ensure_interruption`; global, because a process has one signal handler.
-_pressed: list[float] = []
-
-
-def _has_handler(number: signal.Signals, handler: object) -> bool:
-    """Whether this is the main thread, which alone can set handlers, and a signal has this handler."""
-    return threading.current_thread() is threading.main_thread() and signal.getsignal(number) is handler
-
-
-def _press(_: int, __: FrameType | None) -> None:
-    _pressed.append(time.monotonic())
-    raise KeyboardInterrupt
+def _initializes_extension(frame: FrameType | None) -> bool:
+    """Whether a compiled module is being initialized; an exception there can abort the process."""
+    while frame is not None:
+        if frame.f_code in (
+            ExtensionFileLoader.create_module.__code__,
+            ExtensionFileLoader.exec_module.__code__,
+        ):
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager
@@ -110,15 +143,9 @@ def interrupt_on_termination() -> Iterator[None]:
     Raises:
         KeyboardInterrupt: The process received SIGTERM; `exit_status` then returns `TERMINATED`.
     """
-    handled = _has_handler(signal.SIGTERM, signal.SIG_DFL)
-    if handled:
-        _terminated.clear()
-        signal.signal(signal.SIGTERM, _terminate)
-    try:
+    _terminated.clear()
+    with _handler(signal.SIGTERM, signal.SIG_DFL, _terminate):
         yield
-    finally:
-        if handled:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def exit_status() -> int:

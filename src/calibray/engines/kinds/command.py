@@ -21,6 +21,7 @@ from calibray.engines.protocol import Answer, Responses, check_candidates, gathe
 from calibray.engines.section import EngineSection, OpenedStudy
 from calibray.errors import EngineError, InputError
 from calibray.measurements.observables import Statistic
+from calibray.support.interruption import acknowledge_interruption
 from calibray.support.messages import printable
 from calibray.support.output_files import exists, file_digest
 from calibray.support.progress import Progress
@@ -213,6 +214,7 @@ class Command:
                         start(1)
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
+            acknowledge_interruption()
         finally:
             # If all calls have ended, `stop` stays unset, so the caller can still wait for the answers of another run.
             if pending:
