@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import json
 import os
 import signal
@@ -22,10 +23,12 @@ from calibray import engines
 from calibray.engines.external import program as external_program
 from calibray.engines.external.exchange import RESPONSE_BYTES, Request, Unusable, read_answer
 from calibray.engines.external.program import OWNER_FILE, PREFIX, ExternalProgram, Stopped
+from calibray.engines.kinds import command
 from calibray.engines.process_owner import ProcessOwner
 from calibray.engines.section import RadioSettings
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
+from calibray.support.interruption import INTERVAL, ensure_interruption
 from calibray.tracing.settings import Antenna
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="orphans are taken in on Linux alone")
@@ -319,3 +322,35 @@ def test_what_was_answered_before_an_interruption_is_given(tmp_path):
                 stop.set()
     assert sorted(found) == [0, 1]
     assert len(programs.calls(tmp_path)) <= 4
+
+
+def test_ctrl_c_is_not_raised_again_while_answers_are_saved(tmp_path, monkeypatch):
+    """Two programs have answered when Ctrl-C is pressed; saving the second answer takes longer than the repetition."""
+    waits = []
+
+    def wait(*arguments):
+        waits.append(1)
+        if len(waits) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return concurrent.futures.wait(*arguments)
+
+    saved = []
+
+    def work():
+        with ensure_interruption():
+            for answer in engine.answers(np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5]]), Event()):
+                if not saved:
+                    assert soon(lambda: len(programs.calls(tmp_path)) >= 2)
+                time.sleep(1.0 if not saved else 3 * INTERVAL)
+                saved.append(answer.index)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(command, "wait", wait)
+    try:
+        with engines.open_workers(2) as opened:
+            engine = engines.make(programs.study(tmp_path), workers=opened)
+            with pytest.raises(KeyboardInterrupt):
+                work()
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert sorted(saved) == [0, 1]
