@@ -113,7 +113,13 @@ class Frame:
         return json.dumps(self.record())
 
     def to_scene(
-        self, longitude: ArrayLike, latitude: ArrayLike, height: ArrayLike = 0.0, crs: str = WGS84
+        self,
+        longitude: ArrayLike,
+        latitude: ArrayLike,
+        height: ArrayLike = 0.0,
+        crs: str = WGS84,
+        *,
+        rows: NDArray[np.int64] | None = None,
     ) -> NDArray[np.float64]:
         """Convert positions to the scene's frame.
 
@@ -122,6 +128,7 @@ class Frame:
             latitude: Latitude, positive north of the equator [n], [deg]; or y in the units of `crs`.
             height: Height of each position [n], or one height for all [m], above the vertical datum of the frame.
             crs: Coordinate reference system of the positions.
+            rows: Row of each position in its table [n], for error messages; if None, they state the index.
 
         Returns:
             Positions x, y, z [n, 3], [m].
@@ -132,14 +139,14 @@ class Frame:
         """
         x, y, z = (np.asarray(part, dtype=float) for part in np.broadcast_arrays(longitude, latitude, height))
         if crs == WGS84:
-            _check_degrees(x, y)
+            _check_degrees(x, y, rows)
         easting, northing = transformer(crs, self.crs).transform(x, y)
         # Outside a projection's area of validity, PROJ returns infinity and no error.
         outside = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
         if len(outside):
             raise InputError(
-                f"position ({np.ravel(x)[outside[0]]:g}, {np.ravel(y)[outside[0]]:g}) of {crs} lies outside the "
-                f"projection {self.crs}; check the order of the axes"
+                f"{_name(outside[0], rows)}: ({np.ravel(x)[outside[0]]:g}, {np.ravel(y)[outside[0]]:g}) of {crs} lies "
+                f"outside the projection {self.crs}; check the order of the axes"
             )
         return np.stack([easting - self.easting, northing - self.northing, z - self.height], axis=-1)
 
@@ -228,11 +235,18 @@ def find_projection(
     return best
 
 
-def _check_degrees(longitude: NDArray[np.float64], latitude: NDArray[np.float64]) -> None:
+def _check_degrees(
+    longitude: NDArray[np.float64], latitude: NDArray[np.float64], rows: NDArray[np.int64] | None = None
+) -> None:
     for name, values, bound in (("latitude", latitude, 90.0), ("longitude", longitude, 180.0)):
         outside = np.flatnonzero(~(np.abs(np.ravel(values)) <= bound))
         if len(outside):
             raise InputError(
-                f"{name} of position {outside[0]} is {np.ravel(values)[outside[0]]:g}, must be -{bound:g} to "
+                f"{name} of {_name(outside[0], rows)} is {np.ravel(values)[outside[0]]:g}, must be -{bound:g} to "
                 f"{bound:g} degrees; check the order of the columns and their unit"
             )
+
+
+def _name(index: int, rows: NDArray[np.int64] | None) -> str:
+    """The name of a position in error messages."""
+    return f"position {index}" if rows is None else f"row {rows[index]}"

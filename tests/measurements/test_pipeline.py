@@ -59,8 +59,8 @@ def test_heights_may_count_from_the_ground(log, frame):
 
 
 def test_positions_off_the_globe_name_the_file_and_the_end(log):
-    with pytest.raises(InputError, match=r"log\.csv: rx: latitude of position 0 is 515, must be -90 to 90"):
-        measured_links(log.assign(lat=515.0), columns(), Preparation(frame=FRAME))
+    with pytest.raises(InputError, match=r"log\.csv: rx: latitude of row 5 is 515, must be -90 to 90"):
+        measured_links(log.assign(lat=[48.1, 515.0]), columns(), Preparation(frame=FRAME))
     with pytest.raises(InputError, match=r"log\.csv: no column 'hight'"):
         measured_links(log, columns("hight"), Preparation(frame=FRAME))
 

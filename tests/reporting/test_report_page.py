@@ -301,6 +301,13 @@ def test_a_missing_folder_is_refused_before_the_report_is_made(result, tmp_path)
         cb.report(result, tmp_path / "absent" / "report.html")
 
 
+@pytest.mark.parametrize("name", ["report.pdf", "report", "report.html.gz"])
+def test_a_report_of_another_format_is_refused(result, tmp_path, name):
+    with pytest.raises(InputError, match=r"the report is an HTML page; choose a name that ends in \.html"):
+        cb.report(result, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
 def test_figures_are_written_as_svg_and_png(written):
     names = {path.name for path in (written / "figures").iterdir() if path.suffix in (".svg", ".png")}
     stems = {

@@ -234,7 +234,7 @@ def _positions(
     else:
         longitude, latitude, height = (table.numbers(coordinate) for coordinate in coordinates)
         try:
-            positions = steps.frame.to_scene(longitude, latitude, height, steps.crs)
+            positions = steps.frame.to_scene(longitude, latitude, height, steps.crs, rows=table.row)
         except InputError as error:
             raise InputError(f"{table.source}: {end}: {error}") from None
     if steps.ground is not None:

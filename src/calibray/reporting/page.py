@@ -119,9 +119,12 @@ def report(
         progress: Called with the stage "tracing" after every launch.
 
     Raises:
-        InputError: The file or the folder cannot be written, or a file in it must not be replaced.
+        InputError: The file's name does not end in .html or .htm, the file or the folder cannot be written, or a file
+            in it must not be replaced.
     """
     check_record(result)
+    if Path(file).suffix.lower() not in {".html", ".htm"}:
+        raise InputError(f"output file {file}: the report is an HTML page; choose a name that ends in .html")
     inputs = result.study.files()
     target = check_file(file, inputs, overwrite)
     folder = None if figures is None else check_outputs(figures, PICTURES, inputs, overwrite)
