@@ -338,7 +338,7 @@ def _plan(methods: Sequence[BudgetedMethod], seeds: int, out: str | Path) -> str
     calls = seeds * sum(method.budget for method in methods if not method.stops_by_itself)
     free = "".join(f", not counting {method.name}" for method in methods if method.stops_by_itself)
     return (
-        f"{seeds * len(methods):,} runs with {calls:,} RT calls in total{free}; "
+        f"{seeds * len(methods):,} runs with at most {calls:,} RT calls in total{free}; "
         f"runs that are already stored in {out} are not repeated"
     )
 
