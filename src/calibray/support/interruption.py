@@ -87,7 +87,7 @@ _pressed: list[int] = []
 
 
 @contextmanager
-def _handler(number: signal.Signals, default: object, handler: Handler) -> Iterator[None]:
+def _handler(number: signal.Signals, default: Handler | signal.Handlers, handler: Handler) -> Iterator[None]:
     """Handle a signal within the block, if this is the main thread and the signal has its default handler."""
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(number) is not default:
         yield
