@@ -20,7 +20,6 @@ TERMINATED: Final = 128 + signal.SIGTERM
 INTERVAL: Final = 0.2
 """Time after which a dropped interruption is raised again [s]; any value that a user does not notice would do."""
 
-
 Handler = Callable[[int, FrameType | None], None]
 """Handler of a signal: a function of its number and of the interrupted frame."""
 
@@ -78,7 +77,7 @@ def ensure_interruption() -> Iterator[None]:
 
 def acknowledge_interruption() -> None:
     """Do not raise the interruption again: the caller has caught it, and raises it after saving results."""
-    if _pressed:
+    if signal.getsignal(signal.SIGALRM) is _raise_again:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
