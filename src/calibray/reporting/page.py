@@ -123,10 +123,12 @@ def report(
             in it must not be replaced.
     """
     check_record(result)
-    if Path(file).suffix.lower() not in {".html", ".htm"}:
-        raise InputError(f"output file {file}: the report is an HTML page; choose a name that ends in .html")
     inputs = result.study.files()
     target = check_file(file, inputs, overwrite)
+    if target.suffix.lower() not in {".html", ".htm"}:
+        raise InputError(
+            f"output file {target}: the report is an HTML page; choose a name that ends in .html"
+        )
     folder = None if figures is None else check_outputs(figures, PICTURES, inputs, overwrite)
     data = collect(result, progress)
     drawn = result_figures(result, data.links)
