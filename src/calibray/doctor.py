@@ -38,7 +38,7 @@ if total != 5.0:
     sys.exit(f"the sum is {total}, not 5")
 """
 
-# In a closed box there are the direct path and one reflection from each of the six faces.
+# A closed box has the direct path and one reflection from each of its six faces.
 _TRACE = """
 import sys
 import mitsuba
@@ -124,7 +124,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes a few seconds; no exception is raised if the machine is unusable."""
+    """Check this machine within a few seconds; an unusable machine raises no exception."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),
@@ -179,9 +179,9 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
 
 
 def versions() -> tuple[tuple[str, str], ...]:
-    """Versions of Python, Calibray and each package that Calibray's metadata requires, by name.
+    """Names and versions of Python, Calibray and each package that Calibray's metadata requires.
 
-    For a missing package, the value is the command that installs it.
+    For a missing package, the command that installs it replaces the version.
     """
     packages = {"calibray": "pip install calibray"}
     # A copy of the source that was never installed has no metadata.

@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def _leave() -> NoReturn:
-    """Exit without the shutdown of Python, during which interrupted compiled libraries can crash."""
+    """Exit without shutting Python down, because interrupted compiled libraries can crash during shutdown."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

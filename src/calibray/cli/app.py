@@ -28,7 +28,7 @@ LONGEST: Final = 4096
 
 
 class Commands(TyperGroup):
-    """A group of commands that reports expected failures by a message and an exit status, without a traceback."""
+    """A group of commands that reports expected failures with a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse overlong and empty arguments, then parse."""
@@ -44,8 +44,8 @@ class Commands(TyperGroup):
         """Run the command, and convert errors to exit statuses.
 
         Raises:
-            typer.Exit: With status 2 for bad input, 1 if an engine failed or a file could not be read or written, and
-                130 for Ctrl-C, 143 for SIGTERM.
+            typer.Exit: With status 2 for bad input, 1 for any other expected failure, 130 for Ctrl-C, and 143 for
+                SIGTERM.
             BrokenPipeError: The reader of stdout has closed the stream; Typer handles this error.
         """
         try:
@@ -115,7 +115,8 @@ for command in (  # in the order of `--help`
     doctor, demo, open, init, schema, run, report, compare, validate, trace, predict, map, suggest, export, ledger,
     cache,
 ):  # fmt: skip
-    # Without a short help, Typer truncates the summary. The errors matter only to Python callers.
+    # Without a short help, Typer truncates the summary. The help omits the section Raises, which matters only to Python
+    # callers.
     text = (command.__doc__ or "").partition("\n    Raises:")[0]
     app.command(help=text, short_help=text.partition("\n\n")[0])(command)
 app.add_typer(scene)

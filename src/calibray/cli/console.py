@@ -47,7 +47,7 @@ def echo(text: str, err: bool = False, nl: bool = True) -> None:
 
 @cache
 def print_costs() -> None:
-    """Print the cost of each prediction to stderr before it starts."""
+    """Make every prediction print its cost to stderr before it starts."""
     import logging
 
     class Echo(logging.Handler):

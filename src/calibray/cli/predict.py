@@ -135,7 +135,7 @@ def predict(
 
 @contextmanager
 def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
-    """A function that prints tables as CSV, with a header before the first table."""
+    """Yield a function that prints tables as CSV, with a header before the first table."""
     from calibray.support.output_files import csv_text
 
     header = True

@@ -91,7 +91,7 @@ def run(
 ) -> None:
     """Calibrate a study, print the result, and write it with the calibrated scene and a report."""
     try:
-        # Importing libraries and reading the scene take seconds as well, so the progress starts here.
+        # Importing libraries and reading the scene also take seconds, so the progress display starts here.
         with progress_bars(log()) as progress:
             from calibray.calibration.calibrate import calibrate
             from calibray.engines import open_workers
@@ -281,7 +281,7 @@ def _trace(
     study, links = setup.study, setup.links
     if _traces(study) and (announcement := setup.tracer.plan(links).announcement(len(links))):
         echo(announcement, err=True)
-    # With the antennas and facades of the study, as in a calibration.
+    # `setup.trace` applies the antennas and facades of the study, as in a calibration.
     paths = setup.trace(progress=progress)
     if out is not None:
         paths.save(out, overwrite)

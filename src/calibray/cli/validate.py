@@ -108,7 +108,7 @@ def _check_same_inputs(setup: Setup, folder: Path) -> None:
     """Refuse a folder whose result was calibrated with another scene or other links, before time is spent.
 
     Raises:
-        InputError: A file of the scene or an antenna, or the links have changed since the calibration.
+        InputError: The links, or a file of the scene or of an antenna, have changed since the calibration.
     """
     from calibray.calibration.result import Result
     from calibray.result.files import changed_files, has_links

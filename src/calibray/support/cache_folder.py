@@ -25,8 +25,8 @@ _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | g
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
 """Length of the SHA-256 digest at the start of each entry [bytes]."""
 _PRUNED_AT: Final = 16
-"""On average, the total size is checked once per this number of written entries. With 7,000 entries, a check takes
-0.08 s, as long as compiling a small program."""
+"""Average number of written entries between two checks of the total size. With 7,000 entries, a check takes 0.08 s, as
+long as compiling a small program."""
 
 
 def cache_folder() -> Path | None:
@@ -90,7 +90,7 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
-            # The digest of the name decides whether to check, so that about one in `_PRUNED_AT` new entries does.
+            # The digest of the name decides whether to check the size; about one name in `_PRUNED_AT` leads to a check.
             if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
                 self._remove_oldest()
 

@@ -76,12 +76,12 @@ def ensure_interruption() -> Iterator[None]:
 
 
 def acknowledge_interruption() -> None:
-    """Do not raise the interruption again: the caller has caught it, and raises it after saving results."""
+    """Stop raising the interruption again: the caller has caught it, and will raise it after saving results."""
     if signal.getsignal(signal.SIGALRM) is _raise_again:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-# Whether Ctrl-C was pressed within `ensure_interruption`; global, because a process has one handler per signal.
+# Numbers of the signals received within `ensure_interruption`; global, because a process has one handler per signal.
 _pressed: list[int] = []
 
 
@@ -112,7 +112,7 @@ def _press(number: int, frame: FrameType | None) -> None:
 
 
 def _raise_again(_: int, frame: FrameType | None) -> None:
-    """Raise a dropped interruption again; one that is still being handled, for example to save results, was not."""
+    """Raise a dropped interruption again, unless it is still being handled, for example to save results."""
     error = sys.exception()
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__

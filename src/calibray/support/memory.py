@@ -48,7 +48,8 @@ def available_memory() -> int:
     import psutil  # imported here because `check_address_space` runs without it
 
     free = [psutil.virtual_memory().available]
-    # psutil ignores limits. memory.max of the container contains "max" if there is no limit; file caches can be freed.
+    # psutil ignores limits. Without a limit, memory.max contains "max". Only anonymous memory counts as used, because
+    # file caches can be freed.
     with suppress(OSError, ValueError, StopIteration):
         limit = int((CONTROL_GROUP / "memory.max").read_text())
         lines = (CONTROL_GROUP / "memory.stat").read_text().splitlines()

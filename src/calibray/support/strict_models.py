@@ -13,7 +13,7 @@ from calibray.errors import InputError
 from calibray.support.messages import MAX_LISTED, did_you_mean, shortened
 
 CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-"""Unknown keys, type conversions, and numbers that are not finite are refused."""
+"""Configuration of models that refuse unknown keys, type conversions, and numbers that are not finite."""
 
 Text = Annotated[str, Field(min_length=1)]
 

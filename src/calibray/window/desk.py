@@ -118,7 +118,7 @@ class StudyFolder:
         Raises:
             InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
         """
-        # Some systems encode an umlaut as a letter and a combining mark; some scripts have only combining marks.
+        # Some systems encode an umlaut as a letter and a combining mark; some scripts always need combining marks.
         name = unicodedata.normalize("NFC", name)
         letters = "".join(letter for letter in name if not unicodedata.category(letter).startswith("M"))
         shown = shortened(repr(name))
@@ -329,9 +329,9 @@ class Desk:
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     """The map of the study, or of a scene in the folder if there is no study.
 
-    The map contains `west`, `north` [m] and `scale` [1/m] of the outlines; `buildings` and `walls` as SVG path data;
-    `links`, each with x, y [m], path loss [dB], and 1 if it is suspicious, otherwise 0; `transmitters`, x, y, z [m];
-    and `sites`.
+    The map contains `west`, `north` [m], `scale` [1/m] and `height` of the outlines; `buildings` and `walls` as SVG
+    path data; `links`, each with x, y [m], path loss [dB], and 1 if it is suspicious, otherwise 0; `transmitters`, x,
+    y, z [m]; and `sites`.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -352,7 +352,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
         return shown
     overhead = SceneSurfaces.read(source)
     roofed, wrong = overhead.under_roof(links.rx), overhead.outside(links.rx) | overhead.underground(links.rx)
-    # If most receivers are under a roof, the scene is indoors.
+    # If more than 80 % of the receivers are under a roof, the scene counts as indoors.
     suspicious = wrong if roofed.mean() > 0.8 else wrong | roofed
     rows = zip(links.rx.tolist(), links.path_loss_db.tolist(), suspicious.tolist(), strict=True)
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]
@@ -413,7 +413,7 @@ def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
 def grid_above_ground(
     folder: StudyFolder, scene: str | None, x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> NDArray[np.float64]:
-    """Points [n, 3], [m], at a height above the ground, of a grid with ascending, equally spaced x and y [m].
+    """Points [n, 3], [m], of a grid with ascending, equally spaced x and y [m], at a height above the ground [m].
 
     Raises:
         InputError: There is no scene, or it cannot be read.

@@ -101,8 +101,8 @@ class Jobs:
                     start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
             created = psutil.Process(child.pid).create_time()
-            # Without a wait, the ended process would stay in the process table. The look-up above precedes the wait,
-            # because it would fail afterwards.
+            # Without a wait, the ended process would stay in the process table. After the wait, `create_time` would
+            # fail.
             Thread(target=child.wait, daemon=True).start()
             record = {"words": list(words), "pid": child.pid, "created": created}
             write_text(Path(f"{stem}.json"), json.dumps(record) + "\n")
