@@ -265,7 +265,7 @@ MOST_BLOCKS: Final = 100
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: links that are used for validation instead of calibration, selected in one of three ways.
+    """``[holdout]``: links that are held out to judge the result, selected in one of three ways.
 
     Attributes:
         where: Row filter that selects the held-out links.
@@ -361,7 +361,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
-    """Check a value against the type annotation of the argument; other types, such as arrays, are not checked."""
+    """Check a value against its argument's type annotation, unless that names a type missing from `_TYPES`."""
     types = [part.strip() for part in str(argument.annotation).split("|")]
     if not set(types) - {"None"} <= set(_TYPES):
         return

@@ -148,7 +148,7 @@ class StudyContent(Section, ABC):
         }
 
     def _without_replay(self) -> dict[str, bool]:
-        """Keys that cannot be combined with replay of power sums at one carrier, and whether each is stated."""
+        """Settings that rule out the replay of summed powers at one carrier, and whether each is stated."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",

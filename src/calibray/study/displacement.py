@@ -84,8 +84,8 @@ class Displacement:
 
         Args:
             values: Values of the parameters [d] at which the displacement is 0.
-            neighbours: Displacements on each side, as shares of the largest displacement. Displacements that would
-                exceed the bounds are equidistant up to the bounds.
+            neighbours: Displacements on each side, as shares of the largest displacement. Near a bound, they are
+                limited to equidistant positions up to the bound.
         """
         shares = np.array(neighbours)
         equidistant = np.arange(1, len(shares) + 1) / max(len(shares), 1)
@@ -207,7 +207,7 @@ def displacement_loss(
         # Each copy of a link is displaced along a single axis.
         for number, each in enumerate(displacements):
             there = each.moved(there, np.where(axis == number, offset, 0.0))
-        with np.errstate(invalid="ignore"):  # inf - inf where no path reaches
+        with np.errstate(invalid="ignore"):  # inf - inf where no path arrives
             change_db[moved] = path_loss_db(*traced(there)) - path_loss_db(*here)[link]
     return DisplacementLoss(
         here[0].link,

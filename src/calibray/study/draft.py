@@ -49,16 +49,17 @@ PLACE_SAMPLES: Final = 20
 The logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
-"""Smallest share of values equal to the lowest value that indicates clipping by the receiver."""
+"""Smallest share that indicates clipping by the receiver: values equal to the lowest one, of all values."""
 
 CLIPPED_RATIO: Final = 10
-"""Smallest ratio of the count of the lowest value to the median count of the other values that indicates clipping."""
+"""Smallest ratio that indicates clipping: count of the lowest value to median count of the other values."""
 
 MISSING_SHARE: Final = 0.1
 """Share of missing powers of a device above which the lowest power of the device is used as its noise floor."""
 
 FEWEST_OF_DEVICE: Final = 20
-"""Smallest number of powers of such a device. The lowest of 20 powers is in the lowest tenth in 88 % of cases."""
+"""Smallest number of measured powers from which the noise floor of a device is inferred. The lowest of 20 powers is in
+the lowest tenth in 88 % of cases."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
@@ -189,7 +190,7 @@ def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Serie
 
 
 def _share_at_lowest(values: pd.Series) -> float:
-    """Share of the lowest value if a receiver reports this value for all lower powers; otherwise 0."""
+    """Share of values equal to the lowest one if a receiver seems to report it for all lower powers; otherwise 0."""
     counts = values.value_counts().sort_index()
     share = counts.iloc[0] / counts.sum()
     if share >= CLIPPED_SHARE and counts.iloc[0] >= CLIPPED_RATIO * counts.iloc[1:].median():
@@ -347,7 +348,7 @@ def _indoors(links: LinksDraft) -> bool:
 
 
 def _depth(links: LinksDraft) -> int:
-    """Largest number of interactions: the most walls on 95 % of the straight lines, plus two reflections."""
+    """Largest number of interactions: walls on a straight line (95 % quantile) plus two, within `INDOOR_DEPTHS`."""
     measured = links.measurements()
     walls = int(np.quantile(count_crossings(links.overhead.walls, measured.tx, measured.rx), 0.95))
     lowest, highest = INDOOR_DEPTHS
@@ -367,7 +368,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
     try:
         return read_scene(links.scene, links.frequency), {}
     except InputError:
-        # Table 3 covers every material that occurs in scenes from 1 to 10 GHz.
+        # From 1 to 10 GHz, Table 3 covers every material that occurs in scenes.
         covered = read_scene(links.scene, float(np.clip(links.frequency, 1e9, 10e9)))
     constants = {}
     for name, law in covered.laws.items():

@@ -97,13 +97,13 @@ class LinksDraft:
 
     Attributes:
         scene: Mitsuba XML file, or `sionna:NAME`.
-        links: The table of links.
+        links: File of the table of links.
         target: The future study file.
         given: What the user states.
         section: The keys of ``[links]``.
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
-        table: The links.
+        table: The table of links, without the rows left out so far.
         sites: The table of transmitters, limited to those of the links; None without such a table.
         rx: Columns of the receivers' positions.
         tx: Columns of the transmitters' positions; None if there are no such columns.
@@ -249,7 +249,7 @@ class LinksDraft:
     def _keep_used_transmitters(self, key: str, names: Iterable[object]) -> None:
         """Keep only the transmitters of the links.
 
-        The table of a network also contains other transmitters, with different antennas.
+        A network's table also contains other transmitters, with different antennas.
         """
         if self.sites is not None:
             compared = comparison(self.sites.frame[key])
@@ -447,7 +447,7 @@ class LinksDraft:
 
     @staticmethod
     def _unused_altitudes(frame: pd.DataFrame) -> str:
-        """Hint that a column of altitudes is ignored, because it may be above sea level; empty without one."""
+        """Hint that a column of altitudes is ignored, because altitudes may be above sea level; empty without one."""
         unused = [str(name) for name in frame if column_names.words(name) & ALTITUDES]
         hint = "is ignored, because it may be above sea level; rename it 'height' if it is above the ground"
         return f" ({unused[0]} {hint})" if unused else ""

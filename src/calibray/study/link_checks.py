@@ -343,7 +343,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """The axis changes with the fewest misplaced receivers, and how many; None if more than a quarter of `wrong`."""
+    """The axis changes that misplace fewest receivers, and their number; None if above a quarter of `wrong`."""
     if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -361,7 +361,7 @@ def _units(study: StudyModel) -> Iterator[tuple[str, str]]:
             yield (
                 f"the name of column {name!r} implies a unit of {stated:g} m, but the column is read in units of "
                 f"{unit:g} m",
-                # Degrees have no length, so positions on the globe have no unit to state.
+                # `links.position_unit` does not apply to degrees.
                 "convert it"
                 if links.position == "geographic"
                 else "convert the column, or set links.position_unit if all positions have this unit",

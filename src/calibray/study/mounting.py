@@ -251,8 +251,8 @@ def is_omnidirectional(antenna: Antenna) -> bool:
 
 
 FIRST_SPREAD: Final = 0.25
-"""Initial value of an estimated spread, as a share of the width of the bounds. For a uniform distribution, this share
-is 0.29."""
+"""Initial value of an estimated spread, as a share of the width of the bounds. The standard deviation of a uniform
+distribution is 0.29 of its width."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:

@@ -212,7 +212,7 @@ def _known(frame: Frame | None, path: Path) -> Frame:
 
 @dataclass(frozen=True)
 class Place:
-    """What regions need from a scene: its georeference, if known, and a function that reads its surfaces."""
+    """A scene's georeference, if known, and a function that reads its surfaces, for regions and facades."""
 
     frame: Frame | None
     surfaces: Callable[[], SceneSurfaces]

@@ -132,7 +132,7 @@ _Average = Annotated[
 
 
 class TrackSection(Section):
-    """``[links.track]``: a GPX track from which the position of each row is interpolated at its time.
+    """``[links.track]``: a GPX track from which the position of each row is interpolated at the time of the row.
 
     Attributes:
         file: GPX file, relative to the study file's folder.
@@ -200,7 +200,7 @@ class LinksSection(Section):
         position: "scene" for metres in the scene frame, "geographic" for longitude and latitude or for coordinates in
             `crs`.
         crs: Reference system of "geographic" positions, such as EPSG:32632; longitude and latitude if absent.
-        position_unit: Unit of the position columns in the scene frame [m].
+        position_unit: Length of one unit of the position columns in the scene frame [m].
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
@@ -224,7 +224,7 @@ class LinksSection(Section):
         noise_floor_dbm: Noise floor [dBm]. A missing received power is treated as below the noise floor.
         below_floor: Treatment of rows at or below the noise floor: "exclude" removes these rows, and "censor" keeps the
             rows as upper bounds of the received power, which the intervals account for.
-        inside: Treatment of receivers inside buildings: "keep", "drop", or "move" to the nearest street.
+        inside: Treatment of receivers inside buildings: "keep", "drop", or "move" to the nearest point outside.
         average: How samples are averaged.
     """
 

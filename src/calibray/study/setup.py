@@ -71,8 +71,8 @@ class Setup:
     Attributes:
         study: The study.
         links: All links of the study, including the held-out links.
-        scene: The scene with the start values of the parameters, because the rays that the tracer launches depend on
-            the materials.
+        scene: The scene with the start values of the parameters, because the tracer samples paths according to the
+            materials.
         parameters: The parameters, in the order of the values of a candidate.
         held_out: Mask of the held-out links [L].
         factory: Function that opens the scene in a ray tracer.
