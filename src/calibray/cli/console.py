@@ -85,7 +85,7 @@ class Pool:
     """Options for the workers; the fields are the arguments of `calibray.engines.open_workers`."""
 
     workers: Annotated[
-        int | None, option("N", "Number of local processes among which chunks of links are distributed.")
+        int | None, option("N", "Number of local processes that share the chunks of links.")
     ] = None
     scheduler: Annotated[
         str | None, option("ADDRESS", "Dask scheduler whose workers process chunks of links.")

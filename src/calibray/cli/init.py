@@ -19,7 +19,7 @@ class Known:
 
     transmitters: Annotated[Path | None, option("FILE", "Table of transmitter positions.")] = None
     track: Annotated[
-        Path | None, option("FILE", "GPX track from which the position of each row is taken at its time.")
+        Path | None, option("FILE", "GPX track that gives each row its position at the time of the row.")
     ] = None
     antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
     tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None

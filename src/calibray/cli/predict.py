@@ -121,7 +121,7 @@ def predict(
     if UNREACHED in warnings and result.prediction.fallback is not None:
         received = study.links.noise_floor_dbm is not None
         reason = (
-            "; because it is fitted to links above the noise floor, the true powers may be much lower"
+            ". It is fitted to links above the noise floor, so the true powers may be much lower"
             if received
             else ""
         )
@@ -213,7 +213,7 @@ def suggest(
     options: SuggestOptions,
     permissions: Permissions,
 ) -> None:
-    """Suggest where to measure next: the candidate links that are expected to narrow the intervals most."""
+    """Suggest where to measure next: the candidate links whose measurement is expected to narrow the intervals most."""
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.measurements.table_files import read_table
@@ -311,13 +311,13 @@ class Values:
         float, option("P", "Probability that a measurement lies in the interval; 0 for no interval.")
     ] = 0.9
     power: Annotated[
-        float | None, option("DBM", "Transmit power [dBm], for received power instead of path loss.")
+        float | None, option("DBM", "Transmitted power [dBm], to map received power instead of path loss.")
     ] = None
     samples: Annotated[
         str | None,
         option(
             "N|auto",
-            "Number of rays to use instead of the study's. More rays take more time; too few rays miss paths.",
+            "Number of rays to use instead of the study's. More rays take longer; with too few, paths are missed.",
         ),
     ] = None
     column: Annotated[

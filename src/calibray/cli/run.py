@@ -56,8 +56,8 @@ class RunPool:
         int | None,
         option(
             "N",
-            "Number of local processes among which chunks of links are distributed, or of programs that the engine "
-            "'command' runs in parallel.",
+            "Number of local processes that share the chunks of links, or of programs that the engine 'command' runs "
+            "in parallel.",
         ),
     ] = None
     scheduler: Annotated[

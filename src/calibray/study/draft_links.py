@@ -352,9 +352,9 @@ class LinksDraft:
             return float(carriers[0]), f"lowest carrier of column {name}"
         if self.given.frequency is None:
             raise InputError(
-                f"{file}: column {name!r} has {len(carriers)} carriers; a study can have at most {MAX_CARRIERS}, in Hz "
-                "or in a unit stated in the name of the column, such as frequency_mhz; alternatively, give --frequency "
-                "and a table of one carrier"
+                f"{file}: column {name!r} has {len(carriers)} carriers; a study reads at most {MAX_CARRIERS}, in Hz or "
+                "in the unit that the column's name states, such as frequency_mhz; otherwise, give --frequency and a "
+                "table with one carrier"
             )
         return float(np.nanmedian(values)), f"median of column {name}"
 

@@ -153,10 +153,9 @@ class Study(StudyModel):
             own = {*POSITION_COLUMNS} & {*links.tx, *links.rx}
             if own and links.value in columns and (links.heights is not None or links.position_unit != 1):
                 _LOG.warning(
-                    "%s: columns tx_x to rx_z are read as metres in the scene frame, without links.heights and "
-                    "links.position_unit of the study; for a table in the form of the study's, rename %s in both "
-                    "tables "
-                    "and in the study", table.source, ", ".join(sorted(own)),
+                    "%s: columns tx_x to rx_z are read as metres in the scene frame; links.heights and "
+                    "links.position_unit are not applied. To apply them, rename %s in both tables and in the study",
+                    table.source, ", ".join(sorted(own)),
                 )  # fmt: skip
             return links_from_table(table, group, carrier if links.frequency else None)
         wide = {column: name for column, name in links.wide.items() if column in columns}
