@@ -2,7 +2,8 @@ function [links, paths] = rays_to_links(rays, folder)
 %RAYS_TO_LINKS Tables of links and paths from the rays of MATLAB's ray tracing.
 %   [LINKS, PATHS] = RAYS_TO_LINKS(RAYS) takes the output of raytrace(tx, rx): a cell array of comm.Ray objects with a
 %   row for each transmitter and a column for each receiver. LINKS has a structure for each pair with a ray, PATHS
-%   one for each ray. Structures with the fields of comm.Ray are also accepted, so Octave can read rays that MATLAB has saved.
+%   one for each ray. Structures with the fields of comm.Ray are also accepted, so Octave can read rays that MATLAB
+%   has saved.
 %
 %   RAYS_TO_LINKS(RAYS, FOLDER) writes them to links.csv, which Calibray reads as a table of links, and to paths.csv.
 %

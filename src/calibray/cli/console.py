@@ -152,7 +152,7 @@ def warn(study: Study, links: Measurements) -> None:
     """Print warnings about suspicious links to stderr.
 
     Raises:
-        InputError: The links are far from the scene, or the scene cannot be read.
+        InputError: All receivers or all transmitters are far from the scene, or the scene cannot be read.
     """
     from calibray.reporting.scene_tables import warning_lines
     from calibray.study.link_checks import suspicions

@@ -49,10 +49,10 @@ PLACE_SAMPLES: Final = 20
 The logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
-"""Smallest share that indicates clipping by the receiver: values equal to the lowest one, of all values."""
+"""Smallest share of values equal to the lowest one at which clipping by the receiver is assumed."""
 
 CLIPPED_RATIO: Final = 10
-"""Smallest ratio that indicates clipping: count of the lowest value to median count of the other values."""
+"""Smallest ratio of the lowest value's count to the other values' median count at which clipping is assumed."""
 
 MISSING_SHARE: Final = 0.1
 """Share of missing powers of a device above which the lowest power of the device is used as its noise floor."""

@@ -136,7 +136,7 @@ def with_facades(
     place: Place,
     materials: Mapping[str, Material],
 ) -> Paths:
-    """The paths with the materials of facades at the interactions. If several facades apply, the first is used.
+    """The paths with the facades' materials at their interactions. If several facades apply, the first is used.
 
     `files` contains the resolved paths of the facades' files. `materials` are those of the scene and of the facades.
 
@@ -181,7 +181,7 @@ def _applies(
         applies &= beside < BESIDE
         if section.facing is not None:
             start, end = section.facing
-            # Clockwise from start to end, also across north; equal ends mean a full turn.
+            # Clockwise from start to end, even across north; equal ends mean a full turn.
             applies &= (bearing - start) % 360 <= ((end - start) % 360 or 360)
         if section.share is not None:
             strips = np.maximum(np.round(length / section.module), 1)

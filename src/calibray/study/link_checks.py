@@ -36,7 +36,7 @@ GUIDED_DB: Final = 12.0
 """The same margin under a roof [dB]. In a corridor of 40 m by 2.4 m, four reflections can add 11 dB at 60 GHz."""
 
 FAR: Final = 10.0
-"""Distance from the scene, in scene sizes, beyond which links cannot belong to the scene."""
+"""Distance from the scene, in multiples of its size, beyond which links cannot belong to it."""
 
 CELL_SHARE: Final = 0.05
 """Largest width of averaging areas, as a share of the scene's shorter side."""
@@ -194,7 +194,7 @@ def _transmitters(
 ) -> tuple[NDArray[np.float64], Callable[[NDArray[np.bool_]], str]]:
     """Positions of the transmitters [n, 3], [m], and a function that counts and names those in a mask [n].
 
-    Transmitters with different names count separately, also at one position, such as the sectors of a mast.
+    Transmitters with different names count separately, even at one position, such as the sectors of a mast.
     """
     column, frame = study.links.transmitter, pd.DataFrame(links.tx)
     named = column in links.frame

@@ -286,7 +286,7 @@ def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
 
 
 def with_spreads(study: StudyModel, spreads: Mapping[str, float]) -> dict[str, Any]:
-    """The content of a study with new standard deviations, by field, in the priors of the transmitters."""
+    """The content of a study in which the transmitters' priors have new standard deviations, given by field."""
     content = study.content()
     for name, entry in content["parameters"].items():
         field = name.rpartition(".")[2]

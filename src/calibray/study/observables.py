@@ -149,7 +149,7 @@ class ObservableSection(Section):
         )
 
     def wanted(self, name: str) -> Wanted:
-        """The request for this observable to an external program."""
+        """The request to an external program for this observable."""
         return Wanted(name, self.statistic, self.unit, self.scale)
 
 

@@ -102,7 +102,7 @@ class Setup:
             links: Links that replace those of the study; none of these links is held out.
 
         Raises:
-            InputError: The links, the scene, the parameters or the hold-out cannot be used.
+            InputError: The links, the scene, the parameters or ``[holdout]`` cannot be used.
         """
         if not isinstance(study, StudyModel):
             raise InputError(

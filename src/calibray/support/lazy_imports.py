@@ -1,4 +1,4 @@
-"""Imports on first use, of the names in a package (so that its import is fast) and of optional libraries."""
+"""Imports on first use: of a package's names, so that importing the package is fast, and of optional libraries."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ LEAST_ADDRESS_SPACE: Final = 2_900_000_000
 """Smallest limit on the address space [bytes]; below it, libraries fail to load or terminate the process."""
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
-"""Control group (version 2) of a container, which contains the memory limit."""
+"""Folder of the container's control group (version 2), which states the memory limit."""
 
 
 def check_address_space() -> None:
@@ -79,7 +79,7 @@ def _libraries() -> ThreadpoolController:
 
 
 SECONDS: Final = 20.0
-"""Time limit for reading a small file [s]; on a busy machine, most of the time is spent on starting the process."""
+"""Time limit for reading a small file [s]; on a busy machine, starting the process takes most of this time."""
 
 REFUSED: Final = 3
 """Exit status of code that refuses its input file; the code prints the reason to stdout."""
