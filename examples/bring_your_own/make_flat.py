@@ -23,7 +23,7 @@ SEED = 34
 FREQUENCY = 2.44e9  # [Hz]
 DEPTH = 4
 HEIGHT = 1.5  # [m]
-SAMPLES = 30  # per value: the laptop averages them while it is turned
+SAMPLES = 30  # per value; the laptop averages them while it is turned
 
 PLANTED = {
     "brick_wall": {"relative_permittivity": 5.1, "conductivity": 0.06},

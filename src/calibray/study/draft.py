@@ -476,7 +476,7 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     if folder is not None:
         reason = f"files of {folder.resolve().name}; the receiver's antenna is unknown"
     elif "azimuth_deg" in mount:
-        reason = "azimuths are stated, so 3GPP sectors of 65 degrees and isotropic receivers"
+        reason = "azimuths are stated, so 3GPP sectors of 65 degrees are assumed; receivers are isotropic"
     else:
         reason = "unknown; state the antennas and their orientations"
     if folder is None and name is not None:

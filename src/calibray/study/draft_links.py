@@ -190,7 +190,7 @@ class LinksDraft:
         return ", ".join(map(str, self.table.frame))
 
     def _add_track(self) -> None:
-        """Add the positions of a track at the times of the rows."""
+        """Give each row the position on the track at its time."""
         if self.given.track is None:
             return
         name = column_names.find_time(self.table.frame)

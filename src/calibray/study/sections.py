@@ -156,11 +156,11 @@ class MountingSection(Section):
             addition to its orientation in ``[antennas]``.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
-        electrical_downtilt_deg: Downward shift of the pattern in the frame of the antenna, or of the beam of an array
-            [deg]; a number or a column.
+        electrical_downtilt_deg: Downward shift [deg] of the pattern in the frame of the antenna or, for an array, of
+            its beam; a number or a column.
         steering_deg: Azimuth to which the beam of an array is steered electrically, relative to the antenna [deg]; a
             number or a column. It is measured clockwise if azimuths are compass bearings.
-        aim: "other end" points every antenna at the other end of its link, instead of azimuth and downtilt.
+        aim: "other end" points every antenna at the other end of its link; this replaces azimuth and downtilt.
     """
 
     type: Text | None = None

@@ -187,7 +187,7 @@ class Study(StudyModel):
         joined = shared - {*read_table(self.links_path).frame} if shared else shared
         if joined:
             _LOG.warning(
-                "%s: column %s is ignored, because the calibration has it from %s; rename it to avoid this warning",
+                "%s: column %s is ignored, because the calibration took it from %s; rename it to avoid this warning",
                 table.source, ", ".join(sorted(joined)), self.transmitters_path,
             )  # fmt: skip
         return replace(table, frame=table.frame.rename(columns={name: f"input_{name}" for name in joined}))
