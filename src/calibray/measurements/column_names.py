@@ -68,7 +68,7 @@ PATTERNS: Final = {
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Recognized spellings of column names, without accents. To add a spelling, extend the row. Case and punctuation are
+"""Recognized spellings of column names, without accents. To add a spelling, extend its row. Case and punctuation are
 ignored."""
 
 LENGTH_UNITS: Final = {
@@ -97,7 +97,7 @@ class PositionColumns:
         position: "scene" for metres, "geographic" for degrees.
         x: Column of x coordinates, or of longitudes.
         y: Column of y coordinates, or of latitudes.
-        height: Column of heights; None without such a column.
+        height: Column of heights; None if there is no such column.
     """
 
     position: Literal["scene", "geographic"]
@@ -169,7 +169,7 @@ def matches(name: object, *rows: str) -> bool:
 
 
 def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Find the column of round-trip times or times of flight, with its kind and unit; None without such a column.
+    """Find the column of round-trip times or times of flight, with its kind and unit; None if there is no such column.
 
     Some Wi-Fi devices report a distance in metres instead of a time.
 
@@ -184,14 +184,14 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
             continue
         unit = _unit_of_delay(name, "m")
         if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
-            # Devices that give a round trip in metres state the one-way distance.
+            # Devices that report a round trip in metres give the one-way distance.
             returned = matches(name, "round-trip time") and unit != "m"
             return name, "round_trip_time" if returned else "time_of_flight", unit
     return None
 
 
 def find_delay_spread(frame: pd.DataFrame) -> tuple[str, str] | None:
-    """Find the column of delay spreads, with its unit; None without such a column.
+    """Find the column of delay spreads, with its unit; None if there is no such column.
 
     Example:
         >>> find_delay_spread(pd.DataFrame({"ds_std_ns": [2.0], "RMS Delay Spread [ns]": [80.0]}))
@@ -205,7 +205,7 @@ def find_delay_spread(frame: pd.DataFrame) -> tuple[str, str] | None:
 
 
 def _unit_of_delay(name: str, *others: str) -> str | None:
-    """The unit of time, or one of the other units, that the name of a column states; None without one."""
+    """The unit of time, or one of the other units, that a column name states; None if it states none of them."""
     return next((unit for unit in ("ps", "ns", "us", "ms", "s", *others) if unit in words(name)), None)
 
 
@@ -219,7 +219,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Hint about a column that matches a given row of `PATTERNS` but is not numeric; empty without such a column.
+    """Hint about a column that matches one of the given rows of `PATTERNS` but is not numeric; empty if there is none.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
@@ -236,24 +236,24 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint about a longitude or latitude column that does not contain degrees; empty without such a column.
+    """Hint about a longitude or latitude column that does not contain degrees; empty if there is no such column.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
-        "; column 'lat' has values of about 4734, not degrees; convert NMEA values, or name columns in metres x and y"
+        "; column 'lat' has values of about 4734, not degrees; convert NMEA values, or rename to x and y if in metres"
     """
     for name in numeric_columns(frame):
         largest = 90 if matches(name, "latitude") else 180
         if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
             return (
                 f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees; convert NMEA "
-                "values, or name columns in metres x and y"
+                "values, or rename to x and y if in metres"
             )
     return ""
 
 
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
-    """Find the columns with the position of one end. Columns in metres take precedence over columns in degrees.
+    """Find the columns with the position of one end of a link; metres take precedence over degrees.
 
     With `unnamed`, columns whose names indicate neither transmitter nor receiver can also belong to this end.
 
@@ -296,10 +296,11 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 
 
 def find_value(table: SourceTable) -> ValueColumn:
-    """Find the column of measured values, and its quantity.
+    """Find the column of measured values, and the measured quantity.
 
-    Path loss takes precedence over path gain, and path gain over received power. Columns of RSSI whose names state no
-    decibel unit come last. The sign of the values distinguishes loss from gain.
+    Path loss takes precedence over path gain, and path gain over received power. Received powers other than those of
+    reference signals come last if their names state no decibel unit. The sign of the values distinguishes loss from
+    gain.
 
     Raises:
         InputError: No column appears to contain measured values.
@@ -314,7 +315,7 @@ def find_value(table: SourceTable) -> ValueColumn:
         if rank is None or matches(name, "another quantity"):
             continue
         if _is_plausible(without_codes(table.frame[name]), kinds[rank][1]):
-            # Powers of reference signals come first: they refer to a known bandwidth, but RSSI contains interference.
+            # Powers of reference signals precede RSSI: their bandwidth is known, whereas RSSI includes interference.
             secondary = rank == 2 and not matches(name, "reference signal")
             has_unit = matches(name, "decibel") or not secondary
             candidates.append((not has_unit, rank, secondary, name, kinds[rank][1]))
@@ -329,7 +330,7 @@ def find_value(table: SourceTable) -> ValueColumn:
             f"({', '.join(map(str, table.frame))}); name the column path_loss_db, path_gain_db or "
             f"rsrp_dbm{unlikely or text_instead(table.frame, *(row for row, _ in kinds))}"
         )
-    # The order is losses, gains, powers of reference signals, other powers in decibels, other powers without a unit.
+    # The order is losses, gains, powers of reference signals, other powers in decibels, powers without a unit.
     candidates.sort(key=lambda candidate: candidate[:3])
     *_, name, quantity = candidates[0]
     median = float(np.nanmedian(without_codes(table.frame[name])))
@@ -386,7 +387,7 @@ def find_frequency_unit(name: str, default: str = "hz") -> float:
 
 
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
-    """Find the column of carrier frequencies, and the frequency of each row [Hz]; None without such a column.
+    """Find the column of carrier frequencies, and the frequency of each row [Hz]; None if there is no such column.
 
     The column name contains a word for frequency or a unit of frequency. The unit is read from the name if possible,
     and otherwise inferred from the magnitude of the values.
@@ -409,7 +410,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def no_frequency(frame: pd.DataFrame) -> str:
-    """Hint about a column of carrier frequencies whose values are out of range; empty without such a column.
+    """Hint about a column of carrier frequencies whose values are out of range; empty if there is no such column.
 
     Example:
         >>> no_frequency(pd.DataFrame({"Frequency (Hz)": [1842.5]}))

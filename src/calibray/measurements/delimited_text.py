@@ -1,4 +1,4 @@
-"""Reading of text tables written by loggers and spreadsheets: encoding, separator, header, units, placeholders."""
+"""Read text tables written by loggers and spreadsheets: encoding, separator, header, units, placeholders."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Layout:
     Attributes:
         separator: Column separator; a space represents any white space.
         skipped: Number of lines above the header.
-        units: Unit of each column, from a row of units below the header; empty without such a row.
+        units: Unit of each column, from a row of units below the header; empty if there is no such row.
         unit_lines: First line of the row of units and the line after its end, relative to the first line of the header.
     """
 
@@ -54,7 +54,7 @@ class _Layout:
 
 
 def read_text(path: Path) -> str:
-    """Read the text of a file in UTF-8, in UTF-16, or else in Windows-1252.
+    """Read a file as text in UTF-8 or UTF-16, or else in Windows-1252.
 
     Raises:
         InputError: The file cannot be read, is an archive or contains bytes that are not text.
@@ -87,8 +87,8 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
     r"""Read the rows of a text table, without blank lines.
 
     Lines above the header are skipped if they have a different number of cells or mostly empty cells. Units in a row
-    below the header are appended to the column names. Columns of numbers can contain placeholders (`PLACEHOLDERS`) and
-    the same decibel unit after every number.
+    below the header are appended to the column names. In a column of numbers, cells can contain placeholders
+    (`PLACEHOLDERS`), and all numbers can be followed by the same decibel unit.
 
     Args:
         path: The file, for messages.
@@ -193,7 +193,7 @@ def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]
 
 
 def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Units of the columns, and the first line and end of the row of units; empty and (0, 0) without such a row."""
+    """Units of the columns, and the first line and end of the row of units; empty and (0, 0) if there is none."""
     if len(records) < 3:
         return (), (0, 0)
     (header, *_), (cells, start, end), (below, *_) = records[:3]
@@ -245,7 +245,7 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
         InputError: The decimal mark is not the same in all numbers, or could be a thousands separator.
     """
     lines: dict[str, int] = {}
-    # The first cell such as 1,234 of each column, and the columns with whole numbers of at most four characters.
+    # The first cell like 1,234 in each column, and the columns with whole numbers of at most four characters.
     unclear: dict[int, tuple[int, str]] = {}
     whole: set[int] = set()
     is_clear = False

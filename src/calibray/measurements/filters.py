@@ -1,8 +1,8 @@
 """Row filters: a small, closed expression language for the columns of a table.
 
-Filters are parsed by Python, and this module evaluates the syntax tree on whole columns without `eval`. Only the
-operators, functions and methods listed below are allowed. Attributes, subscripts and other calls are errors. As in
-pandas queries, ``&`` and ``|`` are equivalent to ``and`` and ``or`` and have the same low precedence.
+Python parses a filter, and this module evaluates the syntax tree on whole columns, without `eval`. Only the operators,
+functions and methods listed below are allowed. Attributes, subscripts and other calls are errors. As in pandas queries,
+``&`` and ``|`` are equivalent to ``and`` and ``or``, with the same low precedence.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }  # fmt: skip
-"""The comparisons, in addition to `in` and `not in`."""
+"""The comparison operators that a filter may use, in addition to `in` and `not in`."""
 
 ARITHMETIC: Final[Mapping[type[ast.operator], Callable[[Any, Any], Any]]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow,
 }  # fmt: skip
-"""The arithmetic operators."""
+"""The arithmetic operators that a filter may use."""
 
 FUNCTIONS: Final[Mapping[str, np.ufunc]] = {
     name: getattr(np, name)
     for name in ("abs", "arctan2", "ceil", "cos", "exp", "floor", "log", "log10", "sin", "sqrt", "tan")
 }  # fmt: skip
-"""The functions that take numbers."""
+"""The functions of numbers that a filter may call."""
 
 
 # The functions below are the methods of columns. Their parameters are the arguments that a filter may pass.
@@ -83,7 +83,7 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse to compare a column of text with nothing but numbers, or a column of numbers with nothing but text."""
+    """Refuse to compare a column of text with numbers alone, or a column of numbers with text alone."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
@@ -142,9 +142,9 @@ def _affix(pat: Any, na: Any) -> Any:
     return pat
 
 
-# The search for a pattern with several repetitions, or with a repeated group, may never end in practice. The allowed
-# patterns are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is
-# possessive, so checking a pattern is cheap as well.
+# In practice, a search for a pattern with several repetitions or a repeated group may never end. The allowed patterns
+# are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is possessive, so
+# checking a pattern is cheap as well.
 _CLASS: Final = r"\[\^?(?:\\.|[^\[\]\\])+\]"
 _CHARACTER: Final = rf"(?:\\[^0-9A-Za-z]|\\[bBdDsSwW]|{_CLASS}|[^\\^$*+?{{}}\[\]()|])"
 _ALTERNATIVE: Final = rf"\^?{_CHARACTER}*+[*+?]?{_CHARACTER}*+\$?"
@@ -153,7 +153,7 @@ _REPETITION: Final = re.compile(rf"(?:{_CLASS}|\\.|[^*+?])*+[*+?]")
 
 
 def _check_pattern(pattern: str, column: pd.Series) -> None:
-    """Refuse a regular expression that is malformed or could take too long to search for in a column."""
+    """Refuse a regular expression that is malformed, or for which a search of a column could take too long."""
     if len(pattern) > MAX_PATTERN_LENGTH:
         raise InputError(f"{len(pattern)} characters, must be at most {MAX_PATTERN_LENGTH}; shorten it")
     try:
@@ -179,7 +179,7 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
 
     Raises:
         InputError: The filter is malformed or too large, uses an unknown column or a forbidden construct, or does not
-            result in one truth value per row. The message quotes the faulty part, but not the origin of the filter.
+            give one truth value per row. The message quotes the faulty part, but not the origin of the filter.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -205,7 +205,7 @@ _TOKENS: Final = re.compile(
 
 
 def _as_python(expression: str) -> tuple[str, dict[str, str]]:
-    """A filter as a Python expression, and the column that each replacement of a backticked name represents."""
+    """A filter as a Python expression, and the column that each placeholder for a backticked name stands for."""
     stem = "quoted"
     while stem in expression:
         stem += "_"
@@ -355,7 +355,7 @@ class _Interpreter:
 
     def _comparison(self, node: ast.Compare) -> pd.Series | bool:
         """A comparison, or a chain such as `1 < x < 3`."""
-        # Each side is evaluated once: evaluating it for both neighbours would double the cost at every nesting level.
+        # Each side is evaluated once: evaluating it for both adjacent comparisons would double the cost at every level.
         sides = [node.left, *node.comparators]
         values = [self.value(node.left), *(self._argument(side) for side in node.comparators)]
         results = [

@@ -38,8 +38,8 @@ class Measurements:
         group: Group label of each link [links], or None.
         frequency: Carrier frequency of each link [links], [Hz]; None if all links have the carrier of the study.
         limit_db: Largest measurable path loss [links], [dB]; None if unknown.
-        censored: Mask [links] of the links below the noise floor, which have a path loss of at least `path_loss_db`;
-            None if no link is censored.
+        censored: Mask [links] of the censored links, whose path loss is at least `path_loss_db`; None if no link is
+            censored.
         table: The rows of the source table, for filters and messages; by default, one empty row per link.
 
     Raises:
@@ -143,7 +143,7 @@ class Measurements:
 
     @property
     def group_index(self) -> NDArray[np.int64]:
-        """The index in `group_names` of the group of each link [links]."""
+        """The index of each link's group in `group_names` [links]."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
         # Every group is among the sorted names, so the insertion point is its index.
@@ -195,7 +195,7 @@ class Measurements:
         return self.table.assign(**missing).where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that a filter holds out, which must be at least one but not all.
+        """Mask [links] of the links that a filter holds out: at least one, but not all.
 
         Raises:
             InputError: The filter is not valid, or holds out no link or every link.

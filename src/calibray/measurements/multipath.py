@@ -50,8 +50,9 @@ RADIANS: Final = frozenset({"rad", "radian", "radians"})
 """Words in a column name that indicate angles in radians instead of degrees."""
 
 LEAST_LOSS_DB: Final = 40.0
-"""Path loss in free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is a code for a missing value if all other levels
-exceed this magnitude; levels relative to the strongest component contain 0 dB and smaller magnitudes."""
+"""Path loss in free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is a code for a missing value if the magnitudes of
+all other levels exceed this value. Levels relative to the strongest component also contain 0 dB, but some others have
+smaller magnitudes."""
 
 LONGEST: Final = 0.01
 """Largest plausible delay [s]; light travels 3,000 km in this time."""
@@ -93,8 +94,8 @@ def read_multipath(
         missing: Numbers that represent missing delays or levels; components with such a number are left out.
 
     Raises:
-        InputError: The table cannot be read, has no column of links, delays or powers, or several columns of delays or
-            powers. Delays or powers do not match the unit or sign that the column names imply, or are not plausible.
+        InputError: The table cannot be read, has no column of links, delays or powers, or has several columns of delays
+            or powers. Delays or powers do not match the unit or sign that the column names imply, or are not plausible.
     """
     table = read_table(path)
     # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
@@ -106,7 +107,7 @@ def read_multipath(
 
     def find(what: str, pattern: str, other: str, units: Collection[str]) -> str | None:
         found = [name for name, plain in names.items() if re.search(pattern, plain) and other not in plain]
-        # Of several columns, one that contains another quantity or states no unit is not meant.
+        # If several columns match, those that name another quantity or state no unit are ignored.
         if len(found) > 1:
             found = [name for name in found if not matches(name, "another quantity")] or found
         if len(found) > 1:
@@ -257,7 +258,7 @@ def _value(
         return of_path[statistic.path] * (2 if kind == kinds.ROUND_TRIP else 1)
     if kind == kinds.K_FACTOR:
         strongest = float(weight.max())
-        # Ratio of the strongest component to the sum of all others; infinite for a single component.
+        # Ratio of the strongest component to the sum of all others; undefined (NaN) for a single component.
         return 10 * float(np.log10(strongest / (1 - strongest))) if strongest < 1 else np.nan
     if statistic.edges is not None:
         low, high = statistic.bin

@@ -38,11 +38,11 @@ KINDS: Final = {
 """Kinds of observables and the units of their values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are travel times. Measured travel times can contain a bias of the device."""
+"""Kinds that are travel times. Measured travel times can include a bias of the device."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds that are the fraction of a link's power in a bin. Each bin is a separate observable."""
+"""Kinds whose value is the fraction of a link's power in a bin. Each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
 """Kinds whose measured values can be negative: values in decibels, and times from a clock with a bias."""
@@ -52,8 +52,8 @@ SHARE_RANGE_DB: Final = 30.0
 
 ROUNDING: Final = 1e-12
 """Tolerance within which a delay [s] or azimuth [rad] counts as equal to a limit. Samples at multiples of 1 / bandwidth
-can be at a limit. The tolerance exceeds the rounding errors of differences between delays or azimuths, and is below the
-resolution of any receiver."""
+can lie exactly at a limit. The tolerance exceeds the rounding errors of differences between delays or azimuths, and is
+below the resolution of any receiver."""
 
 
 @dataclass(frozen=True)

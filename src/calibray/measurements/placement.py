@@ -19,21 +19,21 @@ TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
 """The columns with the position of a row on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
-"""The entry in `changes` for rows outside the times of a track. If another time zone fits clearly better, the entry
-also states the `links.track.clock` for it."""
+"""The entry in `changes` for rows that a track does not cover. If another time zone fits clearly better, the entry also
+states the `links.track.clock` for it."""
 
 MAX_FILE_SIZE: Final = 200_000_000
 """Size limit of a GPX file [bytes]. A track with one point per second reaches this size after three weeks."""
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
-    """Add the positions on a track to rows, interpolated linearly in time; rows outside its times are left out.
+    """Add the positions on a track to rows, interpolated linearly in time; rows that it does not cover are left out.
 
-    Times are texts in ISO 8601 (UTC unless a time zone is stated) or seconds since 1970. Altitudes are not used,
-    because altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
+    Times are in ISO 8601 (UTC unless a time zone is stated) or in seconds since 1970. Altitudes are not used, because
+    altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
-        InputError: The track or a time cannot be read, or no row is within the times of the track.
+        InputError: The track or a time cannot be read, or the track covers no row.
     """
     points = _read_gpx(Path(track.file))
     seconds = _row_times(table, track) - track.clock
@@ -60,7 +60,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
 
 
 def read_times(table: SourceTable, name: str) -> NDArray[np.float64]:
-    """Times in a column [rows] of texts in ISO 8601 or numbers [s], as seconds since 1970; NaN if missing.
+    """Read a column of times, in ISO 8601 or in seconds since 1970, as seconds since 1970 [rows]; NaN if missing.
 
     Raises:
         InputError: There is no such column, or a time cannot be read.
@@ -96,7 +96,7 @@ def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
 def _covered(
     times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float
 ) -> NDArray[np.bool_]:
-    """Mask of rows between two successive track points whose times differ by at most `longest_gap`."""
+    """Mask [rows] of the rows between two successive track points whose times differ by at most `longest_gap`."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
     # For a row at exactly the time of a point, the gaps next to this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
@@ -122,7 +122,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
 
 
 def _reason(error: Exception) -> str:
-    """The reason why pandas cannot read a time, without its advice on arguments."""
+    """The reason why pandas cannot read a time, without pandas' advice on its arguments."""
     return first_line(error).partition(". You might")[0]
 
 
@@ -143,7 +143,7 @@ def _read_gpx(path: Path) -> pd.DataFrame:
         raise InputError(
             f"track {path}: not UTF-8 text ({error.reason}); export the track as GPX again"
         ) from None
-    # A GPX track needs no document type; entities could expand beyond memory.
+    # A GPX track needs no document type, and entities could expand until memory is exhausted.
     if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(
             f"track {path}: declares a document type, which GPX does not use; export the track again"
@@ -209,9 +209,9 @@ def place_rows(
 ) -> tuple[SourceTable, Coordinates, Coordinates]:
     """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
-    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude, latitude
-    [deg] and height [m]. The result is the table with these columns, and their names for both ends. If a filter is the
-    only step, the arguments are returned unchanged.
+    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude and
+    latitude [deg] and height [m]. The result is the table with these columns, and their names for both ends. If a
+    filter is the only step, the arguments are returned unchanged.
 
     Raises:
         InputError: A column is missing or not numeric, or a geographic position is invalid.

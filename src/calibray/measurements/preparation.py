@@ -86,9 +86,9 @@ class Averaging:
 
     Attributes:
         by: Samples that are averaged together: samples at one "place" (the same receiver position), in one "cell" of a
-            square grid, in one interval of "distance" travelled (in the order of the rows, separately for rows that are
-            not averaged, such as those of different devices), or in one window of "time".
-        size: Width or length [m], or duration [s]; not used for "place".
+            square grid, in one interval of "distance" travelled (in row order, separately for rows that are never
+            averaged together, such as those of different devices), or in one window of "time".
+        size: Width of a cell or length of an interval [m], or duration of a window [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
         minimum_count: Smallest number of samples in an average; averages over fewer samples are left out.
@@ -140,9 +140,9 @@ class Preparation:
         held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
             merged across parts.
         observables: Columns of additional measured values, such as delays, which are averaged over the rows of a link.
-            Codes for missing values in them count as missing.
+            Codes for missing values in these columns are treated as missing.
         means: Columns of other numbers that are averaged over the rows of a link, such as those of nuisances.
-        flights: Columns of times of flight, in which certain numbers can represent missing values.
+        flights: Columns of times of flight, in which codes of any magnitude are treated as missing values.
         computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
             been added. A function returns None if an optional column that it requires is missing.
         check: Function that refuses a table without a required column, called after the columns of the transmitters

@@ -1,4 +1,4 @@
-"""Conversion of a table to links: reading the file, selecting, positioning, averaging or merging rows, and checks.
+"""Conversion of a table to links: read the file, select and position rows, average or merge them, and check the links.
 
 Samples are averaged in linear power into one row per area or position. Along a street, the power fades by several dB
 within a wavelength. Ray tracing to a single point does not predict this fading, but it does predict the mean power over
@@ -79,7 +79,7 @@ def read_measurements(
 def measured_links(
     table: SourceTable, columns: LinkColumns, steps: Preparation | None = None
 ) -> Measurements:
-    """Convert the rows of a table to measured links. `prepared` contains the numbers of excluded or changed rows.
+    """Convert the rows of a table to measured links. Their attribute `prepared` counts the excluded and changed rows.
 
     Raises:
         InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
@@ -104,7 +104,7 @@ def measured_links(
 def _note_unused(
     table: SourceTable, chosen: SourceTable, steps: Preparation, columns: LinkColumns
 ) -> SourceTable:
-    """Record the transmitters and groups that have chosen rows, but no row left in the table."""
+    """Record the transmitters and groups that have chosen rows, none of which is left in the table."""
     groups = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     for name in dict.fromkeys([*groups, steps.transmitter]):
         if name not in table.frame or name not in chosen.frame:
@@ -273,11 +273,11 @@ _PART: Final = "calibray part"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average samples of the same area, transmitter, frequency and group. Without averaging, the table is unchanged.
+    """Average samples of the same area, transmitter, frequency and group, if `steps.averaging` is set.
 
     A sample below the noise floor has a power between zero and the floor, and is averaged as half the floor. Averages
     with an uncertainty above `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above the
-    floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Each average is the
+    floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Each average has the
     row of its first sample, with the mean receiver position, the mean value, and the means of weights and other
     observables. The added columns are `std_db` (standard deviation of the samples [dB], NaN for one sample) and
     `count`.
@@ -356,7 +356,8 @@ def _areas(
 ) -> NDArray[np.int64]:
     """Index of the position, cell, interval or window of each row [rows]; `rx` names the columns of x, y and z [m].
 
-    Rows with different numbers in `apart` [rows] are not averaged, so each number has its own distance travelled.
+    Rows with different numbers in `apart` [rows] are not averaged together, so each number has its own distance
+    travelled.
 
     Raises:
         InputError: A column is not numeric, a time cannot be read, or the size is not a number greater than 0.
@@ -371,7 +372,7 @@ def _areas(
         return np.floor((elapsed - elapsed.min()) / averaging.size).astype(np.int64)
     positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
     if averaging.by == "distance":
-        # Stretches of equal distance along each track, in the order of its rows.
+        # Stretches of equal length along each track, in the order of its rows.
         steps = pd.DataFrame(positions).groupby(apart).diff().fillna(0.0)
         travelled = pd.Series(np.linalg.norm(steps, axis=1)).groupby(apart).cumsum()
         return np.floor(travelled.to_numpy() / averaging.size).astype(np.int64)
@@ -400,8 +401,8 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
 
 
 SAME_POSITION: Final = 1e-4
-"""Distance per axis up to which positions are treated as equal, as in meshes [m]. Coordinates are written with a
-resolution of a millimetre at best, and coordinate conversions differ by micrometres."""
+"""Distance per axis up to which positions are treated as equal [m]. Coordinates are written with a resolution of a
+millimetre at best, and coordinate conversions differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
@@ -464,7 +465,8 @@ LEAST_STEP_DB: Final = 1.0
 """Smallest effect of a label on the power [dB] that is recorded when rows with different labels become one link."""
 
 LEAST_RATIO: Final = 5.0
-"""Smallest ratio of this effect to its standard error. One in two million labels exceeds this ratio by chance."""
+"""Smallest recorded ratio of this effect to its standard error. One in two million labels exceeds this ratio by
+chance."""
 
 MOST_LABELS: Final = 50
 """Largest number of labels in a column that is tested for such effects. A column with more labels probably names links
@@ -519,7 +521,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions; samples that differ in one of them are not averaged."""
+    """Columns that distinguish links at the same positions; samples that differ in one are not averaged together."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]

@@ -109,7 +109,8 @@ def melt(
     """Convert a table with one column per transmitter to one row per link. Links from one row stay together.
 
     `value` and `transmitter` are the names of the new columns. With `keep_empty`, cells without a value also become
-    links, as required for prediction. `coded` is the number of empty cells that contained codes and are counted.
+    links, as required for prediction. `coded` is the number of empty cells that contained codes and have already been
+    counted.
 
     Raises:
         InputError: A column is missing, not numeric or has the name of a new column, or no cell has a value.
@@ -153,7 +154,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """Choose the function that normalizes names for comparison: `plain_labels`, unless two names become equal."""
+    """Choose how names are normalized for comparison: by `plain_labels`, or by `str` if two would become equal."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels
@@ -199,7 +200,7 @@ def repeated_label(transmitters: SourceTable, column: str) -> str:
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
     """Add the columns of the table of transmitters to the links, and spell their transmitters as in that table.
 
-    Its column of names need not be named `key`.
+    The column of names in that table need not be named `key`.
 
     Raises:
         InputError: A name is repeated or unknown, or a new column would have the name of another one.
@@ -266,8 +267,8 @@ MIN_GAP_DB: Final = 20.0
 """Smallest difference between a code and every measured value [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
-"""Largest plausible magnitude of a power [dBm] or gain [dB]. A listed code with a larger magnitude is a code regardless
-of its sign."""
+"""Largest plausible magnitude of a power [dBm] or gain [dB]. A number in `CODES` with a larger magnitude is a code
+regardless of its sign."""
 
 
 def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float, ...]:
@@ -307,7 +308,7 @@ def mask_codes(
     """Replace the codes in columns of measured values by missing values, and record the number of replaced codes.
 
     Codes are detected in all columns together, which must therefore contain the same quantity. The `stated` codes are
-    always replaced. The table and a mask of the rows that contained a code [rows] are returned.
+    always replaced. Returns the table, and a mask [rows] of the rows that contained a code.
 
     Raises:
         InputError: A column does not exist.

@@ -81,8 +81,7 @@ class SourceTable:
         """Mask [rows] of the rows that pass a filter (see `filters`). Missing values pass only `!=` and `not in`.
 
         Raises:
-            InputError: The expression is malformed, names an unknown column, or does not result in one truth value per
-                row.
+            InputError: The expression is malformed, names an unknown column, or does not give one truth value per row.
         """
         try:
             return evaluate(expression, self.frame)
@@ -158,7 +157,7 @@ class SourceTable:
         """A column as labels [rows], or the labels of several columns joined by spaces.
 
         Raises:
-            InputError: There is no such column, a label is missing, or different labels are equal when joined.
+            InputError: There is no such column, a label is missing, or different labels become equal when joined.
         """
         if not isinstance(names, str):
             rows = list(zip(*(self.labels(name).tolist() for name in names), strict=True))

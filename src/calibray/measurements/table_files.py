@@ -71,7 +71,7 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
 
 
 def _check_archive(path: Path) -> bool:
-    """Check that a workbook is not too large and has rows in order; return whether it contains formulas."""
+    """Check that a workbook is not too large and has its rows in order; return whether it contains formulas."""
     with zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_UNPACKED:
@@ -86,7 +86,7 @@ def _check_archive(path: Path) -> bool:
 
 
 def _check_row_order(path: Path, sheet: bytes) -> None:
-    """Refuse rows in non-ascending order, because openpyxl drops repeated rows and takes hours to fill gaps."""
+    """Refuse rows out of order, because openpyxl drops repeated rows and takes hours to fill gaps."""
     previous = 0
     for text in _ROW.findall(sheet):
         number = int(text) if text.isdigit() and len(text) < 10 else 0
@@ -288,8 +288,8 @@ class PiecedTable:
             integers_with_gaps, start = _integer_columns_with_gaps(file), 0
             batches = file.iter_batches(batch_size=min(size, PIECE_ROWS))
             while (frame := _next_frame(path, batches)) is not None:
-                # NumPy has no missing integer: pandas reads an integer column with gaps as float, except in pieces
-                # without gaps, which are converted here.
+                # NumPy integers cannot be missing, so pandas reads an integer column as float in pieces with gaps. The
+                # other pieces are converted here.
                 numpy_columns = [
                     name
                     for name in integers_with_gaps
@@ -342,7 +342,7 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
     piece.
 
     Raises:
-        InputError: The file requires more memory or time, or is damaged.
+        InputError: The file requires too much memory or time, or is damaged.
     """
     code = _DECODE.format(path=str(path.resolve()), limit=limit, whole=whole, rows=PIECE_ROWS)
     _run_elsewhere(path, code, size)
@@ -352,7 +352,7 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
     """Run a program on a file in a process with limits, once per program and state of the file.
 
     Raises:
-        InputError: The file requires more memory or time, or is damaged.
+        InputError: The file requires too much memory or time, or is damaged.
     """
     status = path.stat()
     key = (code, status.st_mtime_ns, status.st_size, status.st_ino)

@@ -57,7 +57,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 
 
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
-    """Find columns of a wide table that have names like those of transmitters but match no known transmitter.
+    """Find columns of a wide table that are named like those of transmitters but belong to no known transmitter.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
@@ -88,11 +88,11 @@ def name_melted_values(columns: Iterable[str]) -> str:
 
 
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """Find the column with the name of the transmitter in both tables; None without such a column.
+    """Find the column with the name of the transmitter in both tables; None if there is no such column.
 
     Its values in the table of transmitters are distinct. The first such column that contains all values of the links is
-    chosen. Otherwise, the first such column is chosen that has the name of a transmitter column and shares a value with
-    the links.
+    chosen. Otherwise, it is the first such column whose name indicates a transmitter and that shares a value with the
+    links.
     """
     partial = None
     for name in transmitters:
@@ -189,7 +189,7 @@ def find_devices(frame: pd.DataFrame) -> list[str]:
 
 
 LARGEST_ANGLE: Final = {"azimuth_deg": 360.0, "downtilt_deg": 90.0, "electrical_downtilt_deg": 90.0}
-"""Largest plausible angle in a column [deg], by its key in ``[links.tx_antenna]``."""
+"""Largest plausible angle in a column [deg], by the column's key in ``[links.tx_antenna]``."""
 
 POWERS: Final = (-30.0, 100.0)
 """Smallest and largest plausible transmitted power in a column [dBm]."""
@@ -225,7 +225,7 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
 
 
 def lacks_angle(column: pd.Series, may_be_empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask [rows] of the cells without a number, except empty cells of rows that may be empty [rows]."""
+    """Mask [rows] of the cells without a number, except empty cells in rows where a cell may be empty [rows]."""
     lacking = pd.to_numeric(column, errors="coerce").isna() & ~(column.isna() & may_be_empty)
     return lacking.to_numpy(bool)
 
@@ -273,7 +273,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Find the column of EIRP or else transmitted power [dBm] of transmitters, by its key in ``[links]``."""
+    """Find the column of the EIRP, or else of the transmitted power [dBm], by its key in ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)
