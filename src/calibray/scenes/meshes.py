@@ -191,7 +191,7 @@ def _read_ply(content: bytes) -> Mesh:
 
 
 def _check_range(vertices: NDArray[np.float64]) -> None:
-    """Refuse vertices that are not finite, or so far from the origin that areas overflow in single precision."""
+    """Refuse vertices that are not finite, or are so far from the origin that areas overflow in single precision."""
     if (wrong := ~(np.abs(vertices) <= LARGEST_COORDINATE)).any():
         row, axis = np.argwhere(wrong)[0]
         raise InputError(

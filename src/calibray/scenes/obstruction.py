@@ -32,14 +32,14 @@ LINES: Final = 5000
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Vertical prisms over polygons; length inside overlapping prisms counts once.
+    """Vertical prisms over polygons; a length inside overlapping prisms counts once.
 
     Attributes:
         outline: Shapely polygons [n] in the scene's frame [m].
         bottom: Height of the bottom of each prism [n], [m].
         top: Height of the top of each prism [n], [m].
         ground: Function that returns the height of the ground [k], [m], at x and y [k], [m], or NaN where there is no
-            ground. The heights of the prisms are measured from the ground; if None, from z = 0.
+            ground. The heights of the prisms are measured from this ground or, if None, from z = 0.
     """
 
     outline: NDArray[Any]
@@ -97,7 +97,7 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) at heights above ground inside the prism, found in steps."""
+        """The parts of spans (line, lower, upper, prism) with heights above ground inside the prism, found in steps."""
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]
@@ -197,7 +197,7 @@ class Obstruction:
         The wavelength [m] is one value for all links, or one for each link [n].
         """
         parameter = self.clearance / np.sqrt(wavelength)
-        # The bound also replaces the clearance -inf of lines without a roof, which the equation cannot use.
+        # The bound also replaces -inf, the clearance of lines that cross no roof, for which the equation is undefined.
         above = np.maximum(parameter, CLEAR) - 0.1
         loss_db = 6.9 + 20 * np.log10(np.sqrt(above**2 + 1) + above)
         return np.where(parameter > CLEAR, loss_db, 0.0)
@@ -412,7 +412,8 @@ def with_obstruction(
         frequency: Carrier frequency [Hz], used if the links do not state their own.
         regions: The regions of extra loss by name; `REGION` is added only if there are regions.
         clutter: Whether to add `CLUTTER`.
-        cluster_m: Side of the grid squares for `CLUSTER` [m], aligned to the scene's origin; None to omit the column.
+        cluster_m: Side length of the grid squares for `CLUSTER` [m], one of which has a corner at the origin; None to
+            omit the column.
 
     Raises:
         InputError: A carrier frequency is outside the range of the clutter loss.

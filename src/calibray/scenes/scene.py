@@ -293,7 +293,7 @@ def _material(
     frequency: float,
     path: Path,
 ) -> tuple[Material, ItuLaw]:
-    """The constants of a material, from the override or otherwise from the file, and their frequency law."""
+    """The constants of a material, from the override or else from the file, and their frequency law."""
     if isinstance(override, Material):
         return override, frequency_independent_law(override)
     constants = {key: value for key, value in (override or {}).items() if value is not None}
@@ -431,7 +431,7 @@ def export_scene(
 def exported_names(names: Iterable[str]) -> dict[str, str]:
     """Choose unique material names of letters, digits, `_` and `-` for an exported scene.
 
-    Sionna RT refuses a plain `radio-material` with an ITU name, which therefore becomes `calibrated-NAME`. Mitsuba
+    Sionna RT refuses a plain `radio-material` with an ITU name, so such a name becomes `calibrated-NAME`. Mitsuba
     misreads names with dots, quotes or line breaks.
 
     Example:

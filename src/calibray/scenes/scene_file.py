@@ -97,7 +97,9 @@ def scene_path(source: str) -> Path:
         name = source.removeprefix(BUNDLED_PREFIX)
         spec = find_spec("sionna")
         if spec is None or not spec.submodule_search_locations:
-            raise InputError(f"scene {source!r}: sionna-rt is not installed; pip install sionna-rt")
+            raise InputError(
+                f"scene {source!r}: sionna-rt is not installed; install it with: pip install sionna-rt"
+            )
         folder = Path(next(iter(spec.submodule_search_locations))) / "rt" / "scenes"
         path = folder / name / f"{name}.xml"
         if not exists(path):
@@ -300,7 +302,7 @@ def write_scene(
     """
     meshes = {f"{item.name}.ply": item.mesh for item in objects}
     check_outputs(folder, ["scene.xml"], overwrite=overwrite)
-    # Meshes in another folder must not be replaced through a link.
+    # Meshes in another folder must not be replaced through a symbolic link.
     if (folder / MESHES).is_symlink():
         raise InputError(
             f"output folder {folder}: {folder / MESHES} is a symbolic link; remove it, or choose another folder"

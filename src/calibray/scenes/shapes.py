@@ -54,7 +54,7 @@ class SurfaceSize:
         sides: Total length of the sides of all triangles [m].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
         misread: Whether the tracer needs a copy, because the file stores integer coordinates, the shape is a rectangle,
-            or its transform rotates about a vector that is not a unit vector.
+            or its transform rotates it about a vector that is not a unit vector.
     """
 
     low: tuple[float, float, float]
@@ -115,7 +115,7 @@ def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
         raise InputError(
             f"{path}: the transform of shape {shape.get('id')!r} moves vertices to infinity; export the scene again"
         )
-    # Mitsuba shears a shape that rotates about a vector whose length is not 1.
+    # Mitsuba shears a shape that is rotated about a vector whose length is not 1.
     sheared = any(
         abs(np.linalg.norm(_axes(turn, 0.0)) - 1) > 1e-6 for turn in shape.findall("transform/rotate")
     )

@@ -30,7 +30,7 @@ BATCH: Final = 2_000_000
 """Largest number of line-triangle pairs in memory at once; each pair needs about 100 bytes."""
 
 _EDGE: Final = 1e-9
-"""Tolerance within which points outside a triangle in plan count as inside, relative to the triangle's size [1]."""
+"""Distance in plan up to which points outside a triangle count as inside, relative to the triangle's size [1]."""
 
 
 def read_meshes(source: str | Path) -> Iterator[MeshObject]:

@@ -1,9 +1,8 @@
 """Extrusion of buildings into walls, windows, roofs and undersides.
 
-The ground is divided into adjacent cells. In each cell, every building that covers the cell occurs once, between the
-bottom and the top of the building. Where buildings overlap, the taller building is used. Mapped parts of a building
-replace its outline. Adjacent cells have the same corners along their common border, so walls and roofs that meet share
-their vertices.
+The ground is divided into adjacent cells. Each cell lists the buildings that cover it, with their bottoms and tops. At
+heights where buildings overlap, the taller building is used. Mapped parts of a building replace its outline. Adjacent
+cells have the same corners along their common border, so walls and roofs that meet share their vertices.
 
 A border has a wall at the heights at which a building stands on only one of its sides. Between buildings of different
 heights, the wall begins at the lower roof. Between buildings of equal height, there is no wall. All walls that meet at
@@ -96,7 +95,7 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
 
 
 def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Assign heights where buildings overlap to the building with the higher top."""
+    """Assign each height at which buildings overlap to the building with the highest top."""
     stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
         free = [(bottom, top, owner)]

@@ -271,7 +271,7 @@ def read_openstreetmap(
     frame = frame or _local_frame(degrees, WGS84)
     bottoms, tops, sources = zip(*(rule.heights(building) for building in tags), strict=True)
     incomplete = announced - len(outlines)
-    # A stated height or number of storeys that a less reliable source replaces, such as "~25".
+    # Stated heights or numbers of storeys, such as "~25", that a less reliable source replaces.
     unused = [
         building[key]
         for building, source in zip(tags, sources, strict=True)

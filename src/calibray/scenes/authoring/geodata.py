@@ -1,4 +1,4 @@
-"""Reading of vector files and height models with a fixed list of drivers.
+"""Read vector files and height models with a fixed list of drivers.
 
 GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG). It chooses
 the driver by the content of the file. This module opens only formats without references to other files. A file is
@@ -266,7 +266,7 @@ class HeightModel:
             raise InputError(
                 f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values below "
                 f"{HEIGHTS[0]:g} m or above {HEIGHTS[1]:g} m, which are not heights on land, such as {value:g}; "
-                f"declare this as nodata (gdal_edit.py -a_nodata {value:g}), or correct the unit"
+                f"declare this value as nodata (gdal_edit.py -a_nodata {value:g}), or correct the unit"
             )
         return heights
 

@@ -22,7 +22,7 @@ MAX_POINTS: Final = 4_000_000
 
 STEP: Final = 200.0
 """Difference in height from all neighbouring cells above which a cell is suspicious [m]. The number -999 in feet, which
-marks gaps in some models, is a height of -304 m. The tallest buildings and masts in surface models are mostly lower."""
+marks gaps in some models, is a height of -304 m. Buildings and masts in surface models are rarely taller than this."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -171,9 +171,9 @@ def _warn_of_steps(model: HeightModel, heights: np.ma.MaskedArray, first: NDArra
             place = transformer(model.crs, WGS84).transform(*model.dataset.xy(row, column))
             stored = model.stored(float(extreme))
             _LOG.warning(
-                "height model %s: %d of %d cells have the height %.4g m, %.4g m or more from all cells around them; "
-                "the first is at longitude %.5f, latitude %.5f; if they are gaps, declare them as nodata "
-                "(gdal_edit.py -a_nodata %g)",
+                "height model %s: %d of %d cells have the height %.4g m, which differs by at least %.4g m from all "
+                "cells around them; the first is at longitude %.5f, latitude %.5f; if they are gaps, declare them as "
+                "nodata (gdal_edit.py -a_nodata %g)",
                 model.path, cells.sum(), cells.size, extreme, step, *place, stored,
             )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Merging of wall faces in plans that show both faces of each wall, and so contain every wall twice.
+"""Merge wall faces in plans that show both faces of each wall and therefore contain every wall twice.
 
 Sionna RT models a wall as one sheet whose material has a thickness. `merge_faces` replaces two parallel lines of the
 same type, one wall thickness apart, with one sheet midway between them.

@@ -60,7 +60,7 @@ class MeshFaults:
         material: Name of the object's material.
         vertices: Number of vertices.
         faces: Number of triangles.
-        open_edges: Number of edges of only one face, even after vertices at the same position are merged.
+        open_edges: Number of edges that belong to only one face, even after vertices at the same position are merged.
         unwelded_edges: Number of edges at which two faces meet without sharing vertices, so no wedge is found.
         crowded_edges: Number of edges shared by more than two faces, so no wedge is found.
         flipped_faces: Number of faces whose normals point inward, or opposite to those of their neighbours.
@@ -369,14 +369,14 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sign of each face, +1 or -1, that gives neighbours the same orientation [F]; and its connected piece [F]."""
+    """Sign, +1 or -1, that gives each face the orientation of its neighbours [F]; and its connected piece [F]."""
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")
     pairs = order[uses[edge[order]] == 2].reshape(-1, 2)
     one, other = pairs.T // 3
     same = (sides[pairs[:, 0]] == sides[pairs[:, 1]][:, ::-1]).all(axis=1)
-    # The graph has two nodes for each face: f is the face as given, and count + f is the face reversed. Links join
+    # The graph has two nodes for each face: f is the face as given, and count + f is the face reversed. Its edges join
     # orientations of neighbours that agree, so all nodes of one component agree.
     links = np.concatenate(
         [
