@@ -1,7 +1,7 @@
 """Geographic coordinates of a scene.
 
 A scene has a local frame: x points east and y points north from an origin. Map projections distort lengths (UTM by up
-to 0.4 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`), centred on the
+to 1 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`), centred on the
 scene. In this projection, lengths are accurate to 1 mm per kilometre within several kilometres of the centre.
 """
 
@@ -69,7 +69,7 @@ class Frame:
             InputError: The longitude or the latitude is out of range.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
-        # 1e-7 degrees is 1 cm. Rounded, the string is short and states the origin exactly.
+        # Rounded to 1e-7 degrees (1 cm), the string is short and states the origin exactly.
         centre = f"+lat_0={round(float(latitude), 7)!r} +lon_0={round(float(longitude), 7)!r}"
         return cls(f"+proj=aeqd {centre} +datum=WGS84 +units=m", height=height)
 
@@ -85,7 +85,7 @@ class Frame:
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
             raise InputError(f"latitude = {latitude:g}: must be -80 to 84 degrees for UTM; use a local frame")
-        # 180 degrees east would be zone 61. The wider zones of Norway and Svalbard are ignored: regular ones suffice.
+        # 180 degrees east would be zone 61. Regular zones suffice in Norway and Svalbard as well.
         zone = min(int((longitude + 180) // 6) + 1, 60)
         crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         easting, northing, _ = cls(crs).to_scene([longitude], [latitude])[0]
@@ -128,7 +128,7 @@ class Frame:
             latitude: Latitude, positive north of the equator [n], [deg]; or y in the units of `crs`.
             height: Height of each position [n], or one height for all [m], above the vertical datum of the frame.
             crs: Coordinate reference system of the positions.
-            rows: Row of each position in its table [n], for error messages; if None, they state the index.
+            rows: Row number of each position in its table [n], for error messages; if None, messages state the index.
 
         Returns:
             Positions x, y, z [n, 3], [m].
@@ -141,7 +141,7 @@ class Frame:
         if crs == WGS84:
             _check_degrees(x, y, rows)
         easting, northing = transformer(crs, self.crs).transform(x, y)
-        # Outside a projection's area of validity, PROJ returns infinity and no error.
+        # Outside a projection's area of validity, PROJ returns infinity instead of raising an error.
         outside = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
         if len(outside):
             raise InputError(
@@ -220,13 +220,13 @@ def find_projection(
     reach = 3000.0 + 2 * float(np.max(np.subtract(high, low)))
     for crs in dict.fromkeys([*utm, "EPSG:3857", *sorted(f"EPSG:{info.code}" for info in known)]):
         try:
-            # Without the datum, projecting is fast, and the error is less than the shift between datums.
+            # Projecting without a datum transformation is fast, and `reach` allows for the error.
             east, north = pyproj.Proj(crs)(longitude, latitude)
             if not np.hypot(np.median(x) - east, np.median(y) - north) < reach:
                 continue
             placed = frame.to_scene(x, y, 0.0, crs)[:, :2]
         except (InputError, pyproj.exceptions.ProjError):
-            continue  # the scene is outside the projection, or the projection is not of the Earth
+            continue  # the scene is outside the projection, or the projection is for another celestial body
         share = float(((placed >= np.asarray(low)) & (placed <= np.asarray(high))).all(axis=1).mean())
         if share > most or (best is None and share == most):
             best, most = crs, share

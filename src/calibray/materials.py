@@ -29,7 +29,7 @@ def check_frequency(frequency: object, name: str = "frequency") -> float:
     """Check a carrier frequency [Hz] and convert it to a float; error messages call it `name`.
 
     Raises:
-        InputError: The frequency is not a number within the limits `FREQUENCIES`.
+        InputError: The frequency is not a number in the range `FREQUENCIES`.
 
     Example:
         >>> check_frequency(28_500_000_000)
@@ -101,8 +101,8 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""Bounds of each field: those of Sionna RT, with a thickness greater than 0 and exponents of at most 126. An exponent
-of 127 would give infinite or undefined gains."""
+"""Bounds of each field: those of Sionna RT, except that the thickness must be greater than 0 and exponents are at most
+126. An exponent of 127 would give infinite or undefined gains."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
@@ -314,7 +314,7 @@ def itu_material(
         5.31
     """
     if stated := scattering.keys() & {"relative_permittivity", "conductivity"}:
-        raise InputError(f"{min(stated)}: follows from ITU-R P.2040; use Material to give it instead")
+        raise InputError(f"{min(stated)}: follows from ITU-R P.2040; use Material to set it")
     law = itu_law(name, frequency, revision)
     frequency_ghz = frequency / 1e9
     return Material(

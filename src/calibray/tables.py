@@ -26,10 +26,10 @@ ROWS: Final = 10
 """Largest number of rows of a table shown at the prompt; further rows are only counted."""
 
 CHARACTERS: Final = 60
-"""Largest number of characters shown of a cell or a name; longer texts are cut."""
+"""Largest number of characters shown for a cell or a name; longer text is cut."""
 
 SENTENCE: Final = 200
-"""Largest number of characters shown of a sentence; longer sentences are cut."""
+"""Largest number of characters shown for a sentence; longer sentences are cut."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _lines(table: Table) -> str:
     for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
         # The first column names the rows, and a single column contains sentences.
         is_text = column.align == "left" and (index > 0 or len(table.columns) == 1)
-        # Rich takes the longest word as the least width, even where a cell must not wrap.
+        # Rich takes the longest word as the minimum width, even where a cell must not wrap.
         cells = (heading, *(row[index] for row in table.rows))
         least = None if is_text else max(cell_len(printable(cell)) for cell in cells)
         grid.add_column(
@@ -274,5 +274,5 @@ def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:
 
 
 def _short(text: str, length: int) -> str:
-    """Cut a text to a maximum length and escape line breaks and control characters."""
+    """Cut text to a maximum length and escape line breaks and control characters."""
     return printable(text if len(text) <= length else f"{text[: length - 3]}...")

@@ -1,8 +1,8 @@
 """A single parameter: name, bounds, start value in a scene, and frequency law.
 
 The constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], with f in GHz (ITU-R P.2040). An ITU-R
-material has the coefficients of Table 3. The constants of any other material are independent of frequency, as in the
-same law with exponents of 0.
+material has the coefficients of Table 3. The constants of any other material are independent of frequency, which
+corresponds to exponents of 0.
 """
 
 from __future__ import annotations
@@ -165,8 +165,8 @@ class Parameter:
 
 SCATTERING_SPREAD: Final = 0.25
 """Standard deviation of a Gaussian. Its positive half is the prior of a scattering coefficient that is 0 in the scene,
-if the true value is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et al., IEEE
-Trans. Antennas and Propagation 55, 2007)."""
+given that its true value is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et al.,
+IEEE Trans. Antennas and Propagation 55, 2007)."""
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:

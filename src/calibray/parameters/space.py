@@ -30,7 +30,7 @@ MAX_PARAMETERS: Final = 10_000
 
 
 class _Law(NamedTuple):
-    """A law s f^e with s, e or both as parameters."""
+    """A law s f^e in which s, e or both are parameters."""
 
     material: str
     constant: str
@@ -47,7 +47,7 @@ class Parameters:
     Attributes:
         items: The parameters, at least one.
         frequency: Carrier frequency at which laws are evaluated by default [Hz].
-        laws: Laws by material, for materials with a coefficient as a parameter. The other coefficients are fixed at the
+        laws: Laws by material, for materials with a calibrated coefficient. The other coefficients are fixed at the
             values of these laws. By default, the constants are independent of frequency.
 
     Raises:
@@ -310,7 +310,7 @@ class Parameters:
 
     @property
     def search_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The lower and the upper bounds [parameters] of the search space."""
+        """The lower and upper bounds [parameters] of the search space."""
         at_lower = np.array([parameter.at_lower for parameter in self.items], dtype=np.float64)
         return self.to_search(self.lower) - at_lower, self.to_search(self.upper)
 

@@ -4,8 +4,8 @@ The datasets are described in `docs/reference/path-file.md`.
 
 The seal is a checksum at the start of the file, which is verified before anything else is read. HDF5 allows a user
 block in front of the content. This block contains the SHA-256 digest of the content as one line of text. A damaged file
-can hang or crash the HDF5 library (one hang and one crash in 3,000 files with flipped bits), so the library reads a
-file only if the checksum matches. A file from a different source may have been changed and sealed again (reading 5 of
+can make the HDF5 library hang or crash (one hang and one crash in 3,000 files with flipped bits), so the library reads
+a file only if the checksum matches. A file from a different source may have been changed and sealed again (reading 5 of
 3,000 such files took more than a minute). Such a file is first read in a process with limited memory and time. A file
 that Calibray wrote or validated earlier for the same user is recognized by its checksum and read directly.
 """
@@ -197,7 +197,8 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
         return np.array(item.asstr()[()], dtype=object)
     if item.dtype.kind not in {"i": "iu", "f": "f"}[dataset.kind]:
         raise _damaged(f"dataset {name} has the type {item.dtype}")
-    # Other programs may write other sizes and byte orders, not all of which mix; wedges need double precision.
+    # Other programs may write other sizes and byte orders, not all of which can be combined; wedges need double
+    # precision.
     native = item.dtype.newbyteorder("=")
     if dataset.kind == "i":
         return item[()].astype(native if native.itemsize < 8 else np.int64, copy=False)

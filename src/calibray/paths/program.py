@@ -38,7 +38,7 @@ class Paths:
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        materials: The materials of the trace by name; `material` contains indices in this order.
+        materials: The materials of the trace by name; `material` contains indices into them.
         tx_position: Transmitter of every link [L, 3], [m].
         rx_position: Receiver of every link [L, 3], [m].
         link: Link of every path [P], non-decreasing.
@@ -57,10 +57,10 @@ class Paths:
         vertex: Points of interaction [I, 3], [m], for plots; in single precision, or in double precision far from the
             origin. The fields do not depend on these points.
         diffuse: Additional constants of the diffuse interactions.
-        diffraction: Further constants of the diffractions.
+        diffraction: Additional constants of the diffractions.
         settings: Settings of the trace, for documentation.
         correction: Ratio of the power of each path in the engine that found it to its replayed power with the same
-            constants [P]. The replayed power is multiplied by this ratio. None without a correction.
+            constants [P]. The replayed power is multiplied by this ratio. None if there is no correction.
     """
 
     frequency: float

@@ -143,8 +143,8 @@ def write(
     """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
 
     Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
-    written last and contains the digests of the other files: if the run is killed before that, `read` rejects the
-    mixture of two runs. `sentences` and the figures in `validation` are for human readers; `read` ignores them.
+    written last and contains the digests of the other files, so `read` rejects a mixture of two runs if a run is killed
+    before that. `sentences` and the figures in `validation` are for human readers; `read` ignores them.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
@@ -202,7 +202,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
 
 def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> None:
-    """Reject files of several runs, and edited files unless edits are allowed."""
+    """Reject files from several runs, and edited files unless edits are allowed."""
     for name in SIGNED_FILES:
         file = folder / name
         if name not in digests:
@@ -317,7 +317,7 @@ def check_same_study(study: Study, folder: Path) -> None:
 def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
     """Names of the files of the scene and antennas that have changed since the calibration.
 
-    `files` are the current files with their digests, as `Setup.files`.
+    `files` are the current files with their digests, as in `Setup.files`.
     """
     if not result.provenance.files:
         return []
@@ -330,7 +330,7 @@ def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
 
 
 def has_links(result: Record, links: Measurements) -> bool:
-    """Whether a calibration has these links, with their measured values and positions, within rounding in files."""
+    """Whether a calibration used these links: their measured values and positions agree to within rounding in files."""
     table, ends = result.links, result.ends
     pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
     pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]
@@ -350,7 +350,7 @@ def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figure
         measured_db = read_rows(folder, LINKS_FILE, LINKS)["measured_db"].to_numpy()
         if not _same(held_out.measured_db, measured_db):
             raise InputError(
-                f"{folder}: its result has different links ({len(measured_db)}, but the validation has "
+                f"{folder}: its result has different links ({len(measured_db)}, whereas the validation has "
                 f"{len(held_out.measured_db)}); give another folder, or run the study again. If --by separates "
                 "rows of one link, also set [holdout] by"
             )

@@ -64,7 +64,7 @@ AVERAGES: Final[dict[str, Average]] = {
     Model.AVERAGE_LOG_DISTANCE: Average(Model.PRIOR, Model.LOG_DISTANCE),
     Model.AVERAGE_OBSTRUCTION: Average(Model.PRIOR, Model.OBSTRUCTION),
 }
-"""The averages by name. docs/measurements/predictions.md compares two thirds with one half."""
+"""The averages by name. docs/measurements/predictions.md compares the weights 2/3 and 1/2."""
 
 AVERAGE_OF: Final[dict[str, Model]] = {
     Model.INITIAL: Model.AVERAGE_INITIAL,

@@ -27,7 +27,7 @@ from calibray.study import Study
 from calibray.support.messages import type_name
 from calibray.tracing.protocol import EnclosedAntennas
 
-# When `files` reads the sections, Pydantic validates them, including these bounds of numbers.
+# When `files` reads the sections, Pydantic validates them, including these numeric bounds.
 NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
 Offset = Annotated[float, Field(ge=-500, le=500)]
@@ -73,12 +73,13 @@ class Fit:
         laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, for laws with a calibrated coefficient.
         rmse_db: RMSE over the calibration links (paper eq. 1) [dB].
         initial_rmse_db: RMSE with the initial materials and no nuisance [dB].
-        nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None without nuisances.
+        nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None if there are no
+            nuisances.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
-        retrace_gap_db: Largest change of a calibration link's path loss when the scene is traced again with the
+        retrace_gap_db: Largest change in a calibration link's path loss when the scene is traced again with the
             calibrated materials [dB]; None if the paths do not depend on the materials.
         power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths without
-            interaction. The shares can add up to more than 1, because a path contributes to the share of each of its
+            interactions. The shares can add up to more than 1, because a path contributes to the share of each of its
             interactions.
         observables: Accuracy of the calibrated model for the further observables, by name.
     """
@@ -239,9 +240,9 @@ class Record:
         links: One row per link, with its row in the source file, has_path, held_out, and the positions tx_x to rx_z
             [m]. Path loss [dB] is listed as measured, before and after calibration, by the log-distance model, by the
             prediction model (by the fallback for links without a path), and by the scene of the prediction model alone.
-            Another column contains the change in path loss when traced again [dB]. If applicable, further columns are
-            group, frequency [Hz], path loss with the nuisances alone [dB], values in the measured quantity, leverage,
-            depth, and whether the link is censored or near the noise floor.
+            Another column contains the change in path loss when the scene is traced again [dB]. If applicable, further
+            columns are group, frequency [Hz], path loss with the nuisances alone [dB], values in the measured quantity,
+            leverage, depth, and whether the link is censored or near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
         scene: The scene as it was read; None in a loaded result.
@@ -343,7 +344,7 @@ def check_record(result: object) -> None:
     """Refuse anything but a result.
 
     Raises:
-        InputError: It is something else, such as a study.
+        InputError: The object is not a result but, for example, a study.
     """
     if not isinstance(result, Record):
         raise InputError(

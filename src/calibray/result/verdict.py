@@ -23,7 +23,7 @@ class Verdict(StrEnum):
 class ReasonKind(StrEnum):
     """Reasons for a verdict; the comments list the values of each kind."""
 
-    WIDTH = "width"  # share of the range or of a usual range; ranges: other parts of the interval: lower, upper, weight
+    WIDTH = "width"  # share of the range or of a usual range; ranges, other parts of the interval: lower, upper, weight
     SEEN_BUILDINGS = "seen buildings"  # share of the range for the buildings that were measured
     SEPARATE_RANGES = "separate ranges"  # ranges: most probable value, weight
     AT_BOUND = "at bound"  # side, "lower" or "upper"; value, the other end of the interval

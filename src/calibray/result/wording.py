@@ -25,7 +25,7 @@ SHOWN_GROUPS: Final = 4
 """Largest number of groups that a remark lists."""
 
 UNKNOWN_BEST: Final = (
-    "There are no errors on held-out links, so it is unknown which model predicts new links best."
+    "Errors on held-out links are unknown, so it is unclear which model predicts new links best."
 )
 NOT_JUDGED: Final = f"{UNKNOWN_BEST} Set [holdout] blocks = 4, or run calibray validate."
 
@@ -38,7 +38,7 @@ def interval_text(interval: Interval) -> str:
 
 
 def reason_text(reason: Reason | None) -> str:
-    """The reason for a verdict as a clause without a full stop; empty without a reason."""
+    """The reason for a verdict as a clause without a full stop; empty if there is none."""
     return "" if reason is None else _REASONS[reason.kind](reason.values, reason.ranges)
 
 
@@ -96,7 +96,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
         "other buildings of this material may differ"
     ),
     ReasonKind.AT_BOUND: lambda values, _: (
-        f"the interval reaches the {values['side']} bound: the links only show that the value is "
+        f"the interval reaches the {values['side']} bound: the links show only that the value is "
         f"{'below' if values['side'] == 'lower' else 'above'} {values['value']:.4g}, with a probability of 90 %"
     ),
     ReasonKind.NO_EFFECT: lambda values, _: (
@@ -145,8 +145,8 @@ def remark_text(remark: Remark) -> str:
 
 def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
     return lambda values: (
-        f"{finding} (posterior weight {values['weight']:.2f}, independent Gaussian noise "
-        f"{values['gaussian_weight']:.2f}). The intervals account for this."
+        f"{finding} (posterior weight {values['weight']:.2f}, versus "
+        f"{values['gaussian_weight']:.2f} for independent Gaussian noise). The intervals account for this."
     )
 
 
