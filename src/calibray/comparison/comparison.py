@@ -363,11 +363,10 @@ def _search_optimum(problem: ComparisonProblem) -> MethodRun:
 
     def make() -> Optimizer:
         return optimizers.make(
-            # A seed that no run of a comparison has.
             REFERENCE,
             problem.lower,
             problem.upper,
-            2**31,
+            2**31,  # a seed that no run of a comparison has
             start=problem.start,
             starts=starts,
         )

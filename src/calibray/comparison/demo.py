@@ -1,7 +1,7 @@
 """The paper's experiment: the demo district is calibrated with GWO, SGWO-IM, space mapping and `auto`.
 
-Space mapping runs with the engine "retrace", which traces again for every candidate. The engine "retrace" stands for
-engines without stored paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
+Space mapping runs on the engine "retrace", which traces again for every candidate and represents engines without stored
+paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
 """
 
 from __future__ import annotations

@@ -246,7 +246,7 @@ class RunFile:
 
     Runs are appended one by one, so an interrupted comparison continues where it stopped. Failed runs in the file are
     ignored and are therefore repeated. The file is created when the first run is added. `problem` is a digest of
-    everything that determines a run apart from the method, budget and seed.
+    everything, except the method, budget and seed, that determines a run.
 
     Raises:
         InputError: The file contains something other than runs.

@@ -126,9 +126,9 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     """A program without the weakest paths, which together carry at most `share` of a link's total power.
 
-    The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry even less at
-    any one of these candidates. The result is valid for sums of powers. Raises InputError if a parameter's material is
-    not in the paths.
+    The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry at most this
+    share at each of these candidates. The result is valid for sums of powers. Raises InputError if a parameter's
+    material is not in the paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -228,8 +228,8 @@ def _fit_link(
 ) -> tuple[NDArray[np.float64], float] | None:
     """Weights of a link's paths in the pool, and the largest error at new candidates; None if no fit is accurate.
 
-    Weights cannot change a power of zero, so candidates at which the link has no power are omitted, for instance if
-    nothing scatters.
+    Candidates at which the link has no power, for instance because nothing scatters, are omitted: weights cannot change
+    a power of zero.
     """
     # Largest relative error of a power, converted from decibels.
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10

@@ -1,4 +1,4 @@
-"""Make the engine of a study, and a fingerprint of everything that determines its answers apart from the candidate."""
+"""Make the engine of a study, and a fingerprint of everything, except the candidate, that determines its answers."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def fingerprint(study: OpenedStudy) -> str:
 
 
 def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[str, object]]:
-    """The constants that are not calibrated, for all materials."""
+    """The constants of every material that are not calibrated, by name."""
     return {
         name: {
             constant: value

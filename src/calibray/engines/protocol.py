@@ -24,7 +24,7 @@ class Engine(Protocol):
 
     @property
     def calls(self) -> int:
-        """Number of RT calls so far: candidates that the engine has run over all links."""
+        """Number of RT calls so far: one for each candidate that the engine has run."""
         ...
 
     @property
@@ -142,7 +142,7 @@ class Chunked(Differentiable, Protocol):
 
     @property
     def chunks(self) -> Sequence[NDArray[np.int64]]:
-        """Indices of every chunk's links; together they contain every link once."""
+        """Indices of every chunk's links; every link belongs to exactly one chunk."""
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
@@ -153,14 +153,14 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Call a picklable function on every chunk's worker, and return the results in the order of the chunks.
+        """Call a picklable function for every chunk on its worker, and return the results in the order of the chunks.
 
         The first argument is the chunk (`engines.cluster.chunks.Chunk`); the others are the same for all chunks.
         """
         ...
 
     def derived(self, parameters: Parameters, derive: Callable[[Any], Differentiable]) -> Chunked:
-        """The same chunks for other parameters; the picklable function `derive` makes their engines."""
+        """The same chunks with engines for other parameters, made by the picklable function `derive`."""
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:

@@ -155,7 +155,7 @@ class Replay:
         if self._combining.kind == "power":
             self.calls += len(values)
             return responses
-        # Other ways of combining need more than the powers of paths; the methods below count the candidates.
+        # Other ways of combining need more than path powers. The methods below count the candidates themselves.
         if not derivatives:
             return replace(responses, path_loss=self.path_loss(candidates))
         loss, slope = self.path_loss_and_jacobian(candidates)
@@ -266,7 +266,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
-        """Refine the tables in the mask [M, 3] from now on; if one would exceed `FINEST`, stop using tables."""
+        """Refine the tables marked in a mask [M, 3]; if one would exceed `FINEST` intervals, stop using tables."""
         if self._intervals is not None:
             finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -304,7 +304,7 @@ class ReplayCarriers:
     """Stored paths, evaluated at several carriers; parameters can be coefficients of frequency laws.
 
     Args:
-        carriers: The carriers; together they contain every link once.
+        carriers: The paths at each carrier; every link belongs to exactly one carrier.
         parameters: The parameters whose values a candidate contains.
         materials: The scene's materials before calibration, at the carrier of the trace.
         combining: How a link's paths are combined: "power", "coherent" or "band".
@@ -324,8 +324,8 @@ class ReplayCarriers:
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(materials), 0
         self.num_links = sum(len(carrier.links) for carrier in carriers)
-        # Two coefficients of one law act on the same constant: each carrier replays the distinct constants, and
-        # `_constant` maps every parameter to its constant. The mapping is the same at all carriers.
+        # Two coefficients of one law act on the same constant. Each carrier therefore replays only distinct constants,
+        # and `_constant` maps every parameter to its constant. The mapping is the same at all carriers.
         constants = [parameters.at_carrier(carrier.paths.frequency) for carrier in carriers]
         self._constant = constants[0][1]
         self._first = np.unique(self._constant, return_index=True)[1]

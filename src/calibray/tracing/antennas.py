@@ -131,7 +131,7 @@ def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 def array_factor(
     antenna: Antenna, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
 ) -> Any:
-    """Field of a planar array of isotropic elements with equal amplitudes, and with the total power of one antenna.
+    """Field of a planar array of isotropic elements with equal amplitudes and the total power of one antenna.
 
     Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp`
     provides the cosine and the sine. Mutual coupling of the elements is neglected, as in Sionna RT and 3GPP TR 38.901,
@@ -377,7 +377,7 @@ def in_frame(jones: Any, axis: Any, arriving: bool, xp: Any = np) -> Any:
     """Jones vectors [P, ports, 2] in the frame of the interaction next to the antenna.
 
     `axis` is the unit theta vector in that frame [P, 2]: the field of an isotropic vertical antenna. An arriving wave
-    travels against its direction, so its phi axis is mirrored.
+    travels against the direction of arrival, so its phi axis is mirrored.
     """
     sign = -1.0 if arriving else 1.0
     phi = sign * xp.stack([-axis[:, 1], axis[:, 0]], axis=-1)

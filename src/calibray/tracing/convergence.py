@@ -80,7 +80,7 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
     no_path = np.isinf(loss_before) & np.isinf(loss_after)
     return Convergence(
         samples=samples,
-        # inf - inf is NaN, so the change of links without a path in both traces is set to 0.
+        # inf - inf is NaN, so the change of links that have no path in either trace is set to 0.
         change_db=np.where(no_path, 0.0, loss_after - np.where(no_path, 0.0, loss_before)),
         paths_before=np.bincount(before.link, minlength=before.num_links),
         paths_after=np.bincount(after.link, minlength=after.num_links),

@@ -116,7 +116,7 @@ def _gain_dbi(place: str, words: list[str]) -> float:
     if joined is None:
         raise InputError(f"{place}: GAIN {shortened(text)!r}: must be a number, such as 'GAIN 17.5 dBi'")
     value = float(joined.group(1).replace(",", "."))
-    # A unit next to the number, also in brackets, takes precedence over one in a comment.
+    # A unit next to the number, with or without brackets, takes precedence over one in a comment.
     unit = (joined.groups()[-1] or ("dbi" if "dbi" in text.lower() else "dbd")).lower()
     return _cut_in_range(place, "GAIN", value if unit == "dbi" else value + DIPOLE_GAIN_DBI)
 
@@ -130,7 +130,7 @@ def _count(place: str, key: str, words: list[str]) -> int:
 
 
 def _cut(path: str | Path, first: int, lines: list[str], count: int, key: str) -> NDArray[np.float64]:
-    """Attenuation at whole degrees [360], [dB]; `first` is the number of lines of the file before `lines`."""
+    """Attenuation at whole degrees [360], [dB]; `first` is the number of lines that precede `lines` in the file."""
     if len(lines) < count:
         raise InputError(
             f"{path}: {key} states {count} lines, but the file ends after {len(lines)}; export it again"
@@ -209,7 +209,7 @@ class GainTable:
         """Ratio of radiated to accepted power [1]: the mean gain over the sphere; 1 for a lossless antenna."""
         step = np.radians(self.steps_deg[0])
         elevation = np.radians(np.linspace(-90, 90, len(self.gain_dbi)))
-        # Integrals of cos(elevation) times the hat functions of linear interpolation, so that gain 0 dBi gives 1.
+        # Integrals of cos(elevation) times the hat functions of linear interpolation, so that a gain of 0 dBi gives 1.
         weight = 2 * np.cos(elevation) * (1 - np.cos(step)) / step
         weight[[0, -1]] = 1 - np.sin(step) / step
         return round(float(weight @ (10 ** (self.gain_dbi / 10)).mean(axis=1)) / 2, 12)

@@ -1,8 +1,8 @@
-"""Chooses whether the ray tracer runs on a GPU, and otherwise the libLLVM with which Dr.Jit compiles it.
+"""Chooses whether the ray tracer runs on a GPU; if not, chooses the libLLVM with which Dr.Jit compiles its kernels.
 
-Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and an incompatible version aborts the
-whole process. The choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate
-process, and `DRJIT_LIBLLVM_PATH` is set to the best library.
+Without CUDA, Dr.Jit takes the newest libLLVM that it finds, and an incompatible version aborts the whole process. The
+choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate process, and
+`DRJIT_LIBLLVM_PATH` is set to the best library.
 
 `python -m calibray.tracing.llvm` prints the Mitsuba variant and the library that the ray tracer will use. If no library
 is usable, it prints how to install one and exits with status 2.

@@ -258,7 +258,7 @@ class EnclosedAntennas:
     ) -> EnclosedAntennas:
         """Collect the rows of the source file, from the row of each link and the masks of enclosed antennas [L].
 
-        Of the enclosed antennas, those in the masks of antennas below the ground [L] are not inside a body.
+        Antennas that are also in the mask of antennas below the ground [L] are collected only there.
         """
         under = [np.zeros(len(row), dtype=bool) if mask is None else mask for mask in (tx_below, rx_below)]
         tx, rx = tx & ~under[0], rx & ~under[1]

@@ -70,8 +70,8 @@ class TraceSettings:
             least, most = RANGES[name]
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise InputError(
-                    f"trace.{name} = {shortened(repr(value))}: must be a whole number of at least {least} and at most "
-                    f"{most:,}" + (", or 'auto'" if name == "samples" else "")
+                    f"trace.{name} = {shortened(repr(value))}: must be a whole number from {least} to {most:,}"
+                    + (", or 'auto'" if name == "samples" else "")
                 )
 
         if self.diffuse_reflection and self.adaptive:

@@ -35,14 +35,14 @@ LANES_PER_SECOND: Final = 3e7
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
 SMALL_LAUNCH: Final = 5_000_000
-"""Largest number of lanes of a small launch, which finds at most a few thousand candidates and takes at most 0.4 s."""
+"""Largest number of lanes of a small launch, which finds a few thousand candidate paths and takes at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
 """Side of the grid cells for comparing interaction points [m]; points of different paths are seldom so close."""
 
 
 @dataclass(frozen=True)
 class Launch:
-    """Rays from one transmitter, and the receivers to which paths are searched for.
+    """Rays from one transmitter, and the receivers to which the tracer searches for paths.
 
     Attributes:
         source: Position of the transmitter [3], [m].
@@ -149,7 +149,7 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
 
 
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
-    """Split a trace into launches; `source` is the position of the end of each link that sends the rays [L, 3], [m].
+    """Split a trace into launches; `source` contains the position from which the rays of each link start [L, 3], [m].
 
     A launch can have up to `lanes` rays x interactions x receivers; its buffer initially has room for `buffer` paths.
     """

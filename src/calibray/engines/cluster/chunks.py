@@ -45,7 +45,7 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Default limit of the links per chunk; it is raised if there would otherwise be more than `MOST_CHUNKS` chunks."""
+"""Default limit on links per chunk; it is raised if there would otherwise be more than `MOST_CHUNKS` chunks."""
 
 MOST_CHUNKS: Final = 64
 """Largest number of chunks if the study does not state their size. The number is limited because every chunk compiles
@@ -161,7 +161,7 @@ def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
         >>> [chunk.tolist() for chunk in cut(links, 2)]
         [[0, 2], [1, 3]]
     """
-    # Rays start at the transmitters or receivers, whichever have fewer positions; links that share one stay together.
+    # Rays start at the transmitters or receivers, whichever have fewer positions; links at one position stay adjacent.
     ends = (np.unique(end, axis=0, return_inverse=True) for end in (links.tx, links.rx))
     _, position = min(ends, key=lambda unique: len(unique[0]))
     order = np.argsort(position.reshape(-1), kind="stable")
@@ -284,7 +284,7 @@ class ChunkedReplay:
     Args:
         workers: Workers that keep the chunks.
         study: The opened study.
-        chunks: Indices of every chunk's links; together they contain every link once.
+        chunks: Indices of every chunk's links; every link belongs to exactly one chunk.
         opening: Opens the engine of a chunk; picklable.
         materials: Materials that replace those of the scene in the trace, by name.
         progress: Called with "tracing" after every chunk.

@@ -32,8 +32,8 @@ RESPONSE: Final = "its response"
 
 RAY_COLUMNS: Final = ("path", "point")
 """Columns of a ray table that a response with path loss does not have."""
-PATH_LOSS_DB: Final = (20.0, 300.0)  # range of a plausible answer
-RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response: fixed part, and per link
+PATH_LOSS_DB: Final = (20.0, 300.0)  # range of plausible path loss [dB]
+RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response [bytes]: fixed part, and part per link
 RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: a few hundred paths per link
 _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 

@@ -27,7 +27,7 @@ if __name__ == "__main__":
 
 HEAD, TAIL = 500, 1500  # bytes that are kept from the start and the end of an output
 KILL_TIME = 5.0  # longest time to keep killing processes [s]
-POLL = 0.5  # interval between checks: the guard, whether Calibray is alive; Calibray, whether to stop [s]
+POLL = 0.5  # the guard checks whether Calibray is alive, and Calibray whether to stop, at this interval [s]
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
 

@@ -71,7 +71,7 @@ class CommandSection(EngineSection):
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
-        """SHA-256 of the files in the study's folder that the command line names, by name."""
+        """SHA-256 of the files that are named on the command line and lie in the study's folder, by name."""
         folder = study.source.resolve().parent
         files = {word: folder / word for word in self.command if exists(folder / word)}
         return {word: file_digest(file) for word, file in files.items() if file.is_relative_to(folder)}
@@ -93,9 +93,9 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only this candidate is lost: all links count as links without a path. The run ends
-    if every candidate of the first batch fails or if `give_up_after` successive calls fail, because the fault is then
-    probably in the program.
+    If all attempts of a call fail, only this candidate is lost: every link counts as a link without a path. The run
+    ends if every candidate of the first batch fails or if `give_up_after` successive calls fail, because the fault is
+    then probably in the program.
 
     Args:
         program: The program, with the settings of its calls.
@@ -209,7 +209,7 @@ class Command:
                 for future in wait(pending, POLL, FIRST_COMPLETED).done:
                     outcome = self._outcome(future)
                     yield pending.pop(future), outcome
-                    # A killed run repeats the calls whose answers were not stored: at most one per thread.
+                    # A call starts only after an answer is stored, so a killed run loses at most one call per thread.
                     if not stop.is_set():
                         start(1)
         except (Exception, KeyboardInterrupt) as error:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _LOG: Final = logging.getLogger(__name__)
 
 DISPLACED: Final = ("height", "dx", "dy")
-"""Fields of the parameters that displace antennas."""
+"""Values of a parameter's `field` if the parameter displaces antennas."""
 
 
 @final

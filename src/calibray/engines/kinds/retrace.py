@@ -74,7 +74,7 @@ class Retrace:
     """The ray tracer, run again for every candidate.
 
     Args:
-        tracers: The ray tracer at each carrier; together they contain every link once.
+        tracers: The ray tracer at each carrier; every link belongs to exactly one carrier.
         materials: The scene's materials before calibration, at the study's carrier.
         parameters: The parameters whose values a candidate contains.
         combining: How a link's paths are combined: "power", "coherent" or "band".

@@ -37,7 +37,7 @@ from calibray.errors import InputError
 _CLAIMS: Final = """CREATE TABLE IF NOT EXISTS claims (
     problem TEXT NOT NULL, candidate BLOB NOT NULL, run TEXT NOT NULL, owner TEXT NOT NULL, expires REAL NOT NULL,
     PRIMARY KEY (problem, candidate)) WITHOUT ROWID"""
-EXPIRY: Final = 300.0  # time without a renewal after which a claim ends, as the observer measures it [s]
+EXPIRY: Final = 300.0  # a claim ends if another run observes no renewal for this time [s]
 SKEW: Final = 86_400.0  # largest accepted difference between the clocks of two machines [s]
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
 _active_runs: set[str] = set()  # the runs of this process

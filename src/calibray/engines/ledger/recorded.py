@@ -36,7 +36,7 @@ class Recorded:
     Args:
         engine: The engine.
         ledger: The ledger.
-        problem: Fingerprint of everything that determines the engine's answers apart from the candidate.
+        problem: Fingerprint of everything, except the candidate, that determines the engine's answers.
         name: Name of the engine.
         progress: Called with "waiting", the number of answers received from other runs, and the number awaited.
         program_files: SHA-256 of the files of the engine's program, by name, if it has any.
@@ -62,7 +62,7 @@ class Recorded:
 
     @property
     def calls(self) -> int:
-        """Number of RT calls so far: candidates that the engine itself has run."""
+        """Number of RT calls so far: one for each candidate that the engine itself has run."""
         return self._engine.calls
 
     @property

@@ -52,8 +52,8 @@ a few rounding errors of a field in single precision, as in Sionna RT.
 """
 
 HIGH_GAIN_DB: Final = 25.0
-"""Median total gain of unknown antennas above which, or below minus which, a warning is issued [dB]. 18 dBi at one
-end and 7 dBi at the other reach it.
+"""A warning is issued if the median total gain of unknown antennas exceeds this value in magnitude [dB]. The value
+corresponds to 18 dBi at one end and 7 dBi at the other.
 """
 
 
@@ -214,7 +214,7 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
         found = find_edge(surfaces, hits, number)
         face[number], normal[path, at] = found.face, found.normal_0
         edge[path, at], normal_n[path, at] = found.direction, found.normal_n
-        # The next edge, or the receiver.
+        # The second length ends at the next edge or at the receiver.
         onward = np.append(table.kind[path, at + 1 :] == Kind.DIFFRACTION, True)
         lengths[path, at] = (
             segment[path, : at + 1].sum(),

@@ -88,7 +88,7 @@ class Exporting:
 
     @property
     def calls(self) -> int:
-        """Number of RT calls so far: candidates that the engine itself has run."""
+        """Number of RT calls so far: one for each candidate that the engine itself has run."""
         return self._engine.calls
 
     @property

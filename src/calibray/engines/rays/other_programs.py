@@ -131,7 +131,7 @@ INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "
 
 
 INSITE_NAMES: Final = "*.paths.*.p2m"
-"""Names of the files in a folder that contain paths; others contain powers or delays of links."""
+"""Names of the files with paths; the other files in a folder contain powers or delays of links."""
 
 
 def _insite_files(rays: Any) -> list[Path]:
@@ -185,7 +185,7 @@ def _insite_file(file: Path, tx_power_dbm: float) -> list[Polyline]:
     for number, text in rest:
         raise InputError(
             f"{file}, line {number}: {shortened(text)!r} follows the last receiver, according to the number of "
-            f"receivers in line {lines[0][0]}; correct this number, or give a list of unjoined files"
+            f"receivers in line {lines[0][0]}; correct this number, or give the separate files as a list"
         )
     return paths
 
@@ -260,7 +260,7 @@ def read_aodt(folder: Path) -> SourceTable:
         table.frame["time_idx"].to_numpy() if "time_idx" in table.frame else np.zeros(len(table))
         for table in (rays, gains)
     ]
-    # If the first step has no paths, only one of the tables may have rows for it.
+    # The step is chosen from raypaths, because cirs can also have rows for a step without paths.
     frames = [table.frame[time == times[0].min()] for table, time in zip((rays, gains), times, strict=True)]
     responses = {key: rows for key, rows in frames[1].groupby(AODT_PAIR, sort=False)}
     paths = []
@@ -284,7 +284,7 @@ def read_aodt(folder: Path) -> SourceTable:
 def _aodt_response(
     source: str, pair: Any, rows: Any, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power and delay of every path between one radio unit and one user terminal."""
+    """Power and delay of every path of one pair of radio unit and user equipment."""
     lists = [
         [_aodt_numbers(source, name, value) for value in rows[name]]
         for name in ("cir_re", "cir_im", "cir_delay")

@@ -76,7 +76,7 @@ class Surfaces:
 
     def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
         low, high = self.corners.min(axis=1) - within, self.corners.max(axis=1) + within
-        # About 0.5 GB at a time.
+        # The points are tested in parts that need about 0.5 GB each.
         size = max(20_000_000 // max(len(low), 1), 1)
         for start in range(0, len(point), size):
             part = point[start : start + size, None]
@@ -210,7 +210,7 @@ class Edge:
 
 
 def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
-    """The edge of a diffraction: the pair of faces at the point that satisfies Keller's law best.
+    """The edge of a diffraction: of all pairs of faces at the point, the one that satisfies Keller's law best.
 
     Raises:
         InputError: No two faces at the point form an edge that diffracts the wave in the direction of the path.

@@ -44,7 +44,7 @@ OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
 """Optional columns of a table; unknown names are compared with these, because a misspelt name would be ignored."""
 
 HIT_MATERIAL: Final = "hit_material"
-"""Optional column like `material`, which decides only where surfaces of different materials coincide."""
+"""Optional column like `material`, used only where surfaces of different materials coincide."""
 
 QUANTITIES: Final = {
     "gain_real": r"\b(re|real)\b",
@@ -53,7 +53,7 @@ QUANTITIES: Final = {
     "delay": "delay",
     "material": "material",
 }
-"""Patterns in column names, with blanks instead of separators, and the column that each probably refers to."""
+"""For each column, the pattern of unknown names that probably refer to it; separators in a name are read as blanks."""
 
 MISSPELT: Final = 0.8
 """Smallest similarity at which an unknown column is considered misspelt; `line` is not considered a misspelt `link`."""
@@ -82,7 +82,7 @@ class RayTable:
         kind: Kinds of interaction, 0 beyond the last one [P, D].
         material: Names of materials, empty where not stated [P, D].
         object: Names of objects, empty where not stated [P, D].
-        hit_material: Names of materials that decide only where surfaces coincide, empty where not stated [P, D].
+        hit_material: Names of materials, used only where surfaces coincide; empty where not stated [P, D].
         power: Path gain [P], 0 for an absent path; None if not stated.
         delay: Propagation delay [P], [s]; None if not stated.
     """

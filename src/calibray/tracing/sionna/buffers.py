@@ -40,7 +40,8 @@ def to_points(position: NDArray[np.float64]) -> mi.Point3f:
 
 def to_numpy(vectors: Any) -> NDArray[np.float64]:
     """Convert points or vectors to double precision [n, 3]."""
-    # Otherwise, one kernel computes and interleaves the values, and is compiled again for each number of vectors.
+    # Without this evaluation, one kernel would compute and interleave the values, and would be compiled again for each
+    # number of vectors.
     dr.eval(vectors)
     return np.stack([np.array(axis, dtype=float) for axis in vectors], axis=-1)
 

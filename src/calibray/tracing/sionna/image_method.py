@@ -40,8 +40,9 @@ number."""
 CONFUSABLE_PLANE: Final = 0.05
 """The same limit for planes that the tracer can confuse in single precision."""
 MARGIN: Final = 0.1
-"""Largest distance of a valid point outside a surface [m]; this margin allows for single precision and rounded
-corners."""
+"""Largest distance by which a valid point may lie outside a surface [m]; it allows for single precision and rounded
+corners.
+"""
 NEAR_PLANE: Final = 0.01
 """Distance from a plane below which a point can be on either side of the plane [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
