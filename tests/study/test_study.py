@@ -222,7 +222,7 @@ TRACE = "max_depth = 4"
         ("frequency = 4e9", "frequency = '4e9'", "scene.frequency = '4e9': must be a number"),
         ("frequency = 4e9", "frequency = inf", "scene.frequency = inf: must be a finite number"),
         ("bandwidth = 2e8", "bandwidth = 0", "scene.bandwidth = 0: must be greater than 0"),
-        (TRACE, "max_depth = -1", "study.toml: trace.max_depth = -1: must be a whole number of at least 0"),
+        (TRACE, "max_depth = -1", "study.toml: trace.max_depth = -1: must be a whole number from 0 to 100"),
         (TRACE, "max_depth = true", "trace.max_depth = True: must be a whole number"),
         ("[offset]", "[noise]\nheterogeneity = 3\n[offset]", "= 3: must be one of 'auto', or must be at most 2"),
         ("[offset]", "[noise]\nheterogeneity = 'a'\n[offset]", "must be one of 'auto', or must be a number"),

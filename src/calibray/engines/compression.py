@@ -38,7 +38,7 @@ FIT_SHARE: Final = 0.1
 """Share of the tolerance that the fit may use; the rest allows for candidates between the training candidates."""
 
 CHECK_SHARE: Final = 0.5
-"""Largest error at new candidates as a share of the tolerance; the rest allows for candidates that are not checked."""
+"""Largest accepted error at new candidates, as a share of the tolerance; the rest allows for unchecked candidates."""
 
 TRAINING: Final = 16
 """The first fit uses TRAINING * (d + 1) random candidates for d parameters, in addition to corners of the bounds."""
@@ -56,7 +56,7 @@ RANKING: Final = 16
 """Number of candidates used to rank the paths by power."""
 
 POOL: Final = 2000
-"""Largest number of a link's strongest paths in the fit, and also of its other paths, which are chosen at random."""
+"""Largest number of a link's strongest paths in the fit, and largest number of its other paths, chosen at random."""
 
 BATCH_POWERS: Final = 400_000_000
 """Largest number of powers (paths times candidates) in memory at once."""
@@ -124,7 +124,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """A program without the weakest paths, which together carry at most `share` of a link's total power.
+    """A program without the weakest paths of every link, which together carry at most `share` of the link's power.
 
     The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry at most this
     share at each of these candidates. The result is valid for sums of powers. Raises InputError if a parameter's
@@ -198,7 +198,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Divide links into batches such that the powers of a batch's paths in the pool fit into memory."""
+    """Divide links into batches so small that the powers of their paths in the pool fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 

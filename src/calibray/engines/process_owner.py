@@ -50,7 +50,7 @@ class ProcessOwner:
 
     @classmethod
     def from_record(cls, record: object) -> ProcessOwner | None:
-        """The owner from the value of `record`; None if the value is malformed."""
+        """The owner from a dictionary that `record` returned; None if the value is malformed."""
         try:
             owner = cls(**record)  # type: ignore[arg-type]
         except TypeError:

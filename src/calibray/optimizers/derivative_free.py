@@ -83,7 +83,7 @@ class POUNDERS(Optimizer):
 def _searches(
     local: Callable[..., Search], seed: int, budget: int, *settings: float
 ) -> Callable[[Archive], Search]:
-    """Local searches from successive starting points in the unit cube, within the budget."""
+    """Make a function that runs local searches from successive starting points, within the budget."""
     rng = np.random.default_rng(whole("seed", seed, at_least=0))
 
     def search(archive: Archive) -> Search:

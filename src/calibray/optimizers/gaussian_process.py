@@ -21,7 +21,7 @@ from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
-"""Number of candidates drawn over the whole box, and also of candidates drawn around the best points."""
+"""Number of candidates drawn over the whole box, and number drawn around the best points."""
 
 
 @final

@@ -73,7 +73,7 @@ LEVEL = 1e-4
 """Relative difference in mean square below which two minima are considered to fit equally well, as along a valley."""
 
 NOISELESS = 1e-9
-"""Share of the largest mean square added to this difference; without noise, the lowest ones are rounding errors."""
+"""Share of the largest mean square added to this difference; without noise, the lowest values are rounding errors."""
 
 APART = 0.01
 """Distance in the unit cube below which two searches are considered to have ended in the same minimum."""

@@ -46,10 +46,10 @@ from calibray.optimizers.sampling import (
 )
 
 FIRST = 5
-"""Largest excess of the number of points in the initial design over the number of parameters."""
+"""Largest number of points in the initial design minus the number of parameters."""
 
 CANDIDATES = 600
-"""Number of candidates drawn over the whole box, and also of candidates drawn around the best points."""
+"""Number of candidates drawn over the whole box, and number drawn around the best points."""
 
 DRAWS = 256
 """Number of draws of the residuals for the expected improvement."""

@@ -1,4 +1,4 @@
-"""Stored traces: the same scene, links, antennas, settings and versions are traced only once.
+"""Stored traces: links are traced only once with the same scene, antennas, settings and versions.
 
 Traces are stored in Calibray's cache folder (`support.cache_folder`). A damaged trace is removed, with a warning in the
 log. If several users share the folder, each user's runs read only traces written by that user or root.

@@ -24,7 +24,7 @@ RAYS_PER_ROUND: Final = 250_000
 """Number of rays per launch if rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
-"""Allowed ranges of the numbers; no machine can trace more rays or interactions, and Sionna RT's seeds have 32 bits."""
+"""Allowed ranges of settings; no machine can trace more rays or interactions, and Sionna RT's seeds have 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Antenna:
         return self.pattern if is_gain_file(self.pattern) else None
 
     def record(self) -> dict[str, object]:
-        """The antenna by attribute, for digests; a gain table is represented by its content, not its file name."""
+        """The attributes by name, for digests; a gain table is represented by its content, not its file name."""
         record: dict[str, object] = asdict(self)
         if self.gain_file is not None:
             record["pattern"] = read_gain_table(self.gain_file).digest()

@@ -5,7 +5,7 @@ A launch sends rays from one transmitter and searches for paths to several recei
 combination of ray, interaction and receiver, called a *lane*. The receivers of a transmitter are therefore split over
 launches; if one receiver needs too many lanes, the rays are split as well. Sionna's rays form a lattice of directions
 that does not depend on the seed. Each launch gets a share of the lattice, so all launches together send the same rays
-as a single launch.
+as a single launch would.
 """
 
 from __future__ import annotations

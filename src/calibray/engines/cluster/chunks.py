@@ -129,7 +129,7 @@ def identity(value: Content) -> Content:
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """Make a function that accepts a finished chunk's number and reports the links done so far as "tracing"."""
+    """Make a function that, called with a finished chunk's number, reports the links done so far as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:

@@ -38,8 +38,8 @@ class ReplaySection(EngineSection):
         compress_db: Largest error in path loss when a few weighted paths replace all paths [dB]; None to replay all
             paths.
         chunk_links: Largest number of links that are traced and replayed together. If None, all links are traced
-            together. With workers, the default is `chunks.CHUNK_LINKS`, or more if there would otherwise be more than
-            `chunks.MOST_CHUNKS` chunks.
+            together without workers; with workers, the number is `chunks.CHUNK_LINKS`, or more if there would otherwise
+            be more than `chunks.MOST_CHUNKS` chunks.
         rays: Ray table with the paths of another engine, to be used instead of a trace.
     """
 
@@ -99,8 +99,8 @@ class ReplaySection(EngineSection):
             study.radio.combining != "power" or study.links.frequency is not None or study.parameters.has_laws
         ):
             raise InputError(
-                f"{study.source}: engine.compress_db = {self.compress_db:g} requires objective.combining = 'power' "
-                "and a single carrier, and no coefficient of a frequency law as a parameter; remove engine.compress_db"
+                f"{study.source}: engine.compress_db = {self.compress_db:g} requires objective.combining = 'power', "
+                "a single carrier, and no coefficient of a frequency law as a parameter; remove engine.compress_db"
             )
 
 

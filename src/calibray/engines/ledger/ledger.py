@@ -237,8 +237,8 @@ class Ledger:
     def table(self, path_loss: bool = False) -> pd.DataFrame:
         """All RT calls in the order in which they were committed; damaged calls are omitted with a warning.
 
-        The columns are `problem` (the start of its fingerprint), `engine`, `time`, `seconds`, `status` ("ok" or
-        "failed"), `message` and one column per parameter. With `path_loss`, there is also one column per link:
+        The columns are `problem` (the start of the problem's fingerprint), `engine`, `time`, `seconds`, `status` ("ok"
+        or "failed"), `message` and one column per parameter. With `path_loss`, there is also one column per link:
         `link_1`, `link_2`, ... [dB].
 
         Raises:

@@ -81,7 +81,7 @@ class Recorded:
         return self._engine.materials
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the ledger or otherwise from the engine; see `Answering`."""
+        """Path loss of every link for candidates, from the ledger or else from the engine; see `Answering`."""
         answers, first = self._all_answers(candidates)
         return gather(answers, (len(candidates), self._engine.num_links), first)
 
@@ -122,7 +122,7 @@ class Recorded:
             self._ledger.forget_failures(self._problem)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Yield answers from the ledger, or otherwise from the engine, until `stop` is set; see `Answering.answers`."""
+        """Yield answers from the ledger, or else from the engine, until `stop` is set; see `Answering.answers`."""
         values, stop = candidates, stop or Event()
         self._warn_of_changed_files()
         # A candidate that occurs several times in one batch is run only once.

@@ -291,7 +291,7 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 
 
 def _names(table: SourceTable, name: str) -> NDArray:
-    """Values of a column as integers, which sort as numbers, or otherwise as labels [rows]."""
+    """Values of a column as integers if possible, so that they sort as numbers, and otherwise as labels [rows]."""
     column = table.column(name)
     if pd.api.types.is_integer_dtype(column) and not column.isna().any():
         return column.to_numpy()

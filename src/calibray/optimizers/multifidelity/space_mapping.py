@@ -74,7 +74,7 @@ CONVERGED: Final = 1e-6
 """Relative decrease in cost, or step in the unit cube, below which a local search has converged."""
 
 CANDIDATES: Final = 300
-"""Number of candidates drawn over the whole box, and also of candidates drawn around the best points."""
+"""Number of candidates drawn over the whole box, and number drawn around the best points."""
 
 DRAWS: Final = 512
 """Number of draws of the discrepancy for the expected improvement, in total over all members."""
@@ -107,7 +107,7 @@ MISLED: Final = 2.0
 """Error ratio above which a later check fails; by then, points are so close that any process predicts them well."""
 
 DOUBTS: Final = 2
-"""Number of successive failed checks after which the cheap model is dropped, and of checks that use `HELPFUL`."""
+"""The cheap model is dropped after this many failed checks in a row; as many checks at the start use `HELPFUL`."""
 
 
 @final
@@ -206,7 +206,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """Minima of the uncorrected cheap model without the first `turn`, and then random points [count, d]."""
+        """Minima of the uncorrected cheap model after the first `turn`, and then random points [count, d]."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:

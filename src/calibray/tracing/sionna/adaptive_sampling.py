@@ -38,7 +38,7 @@ from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
 
 CONVERGED_DB: Final = 0.05
-"""Largest change of a link's path loss in a round at which the link counts as converged [dB]."""
+"""Largest change in a link's path loss in a round with which the link still counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
 """The search ends after this many consecutive rounds without a change above `CONVERGED_DB`."""
 MAX_LAUNCHES: Final = 256
@@ -136,7 +136,7 @@ class AdaptiveSearch:
     def run(
         self, plan: TracePlan, targets: NDArray[np.float64], progress: Progress | None
     ) -> tuple[tuple[TracedBuffer, ...], dict[str, object]]:
-        """Find the paths from the sources, one launch of the plan for each, to the other ends of the links [L, 3], [m].
+        """Find the paths from the source of every launch to the other ends of the links [L, 3], [m].
 
         Returns the paths, the largest number of rays of a source, and the largest change of a link in the last round.
         `progress` is called before the first source and after each source.

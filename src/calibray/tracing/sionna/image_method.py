@@ -214,7 +214,7 @@ class Meshes:
         self.surfaces = Surfaces(np.concatenate(corners) if corners else np.zeros((0, 3, 3)))
 
     def triangles(self, shape: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Indices of triangles in the scene [...], from their shapes and indices within these; 0 without a shape."""
+        """Indices of triangles in the scene [...], from their shapes and their indices in these; 0 without a shape."""
         distinct, position = np.unique(shape, return_inverse=True)
         starts = np.array([self._first.get(key, -1) for key in distinct.tolist()], dtype=np.int64)
         first = starts[position.reshape(shape.shape)]

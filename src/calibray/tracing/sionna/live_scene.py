@@ -79,8 +79,8 @@ class LiveScene:
         live = _checked(scene)
         if not (live.transmitters and live.receivers and live.tx_array and live.rx_array):
             raise InputError(
-                "the scene has no transmitter, receiver or antenna array; add them, and set scene.tx_array and "
-                "scene.rx_array"
+                "the scene lacks a transmitter, a receiver or an antenna array; add what is missing, and set "
+                "scene.tx_array and scene.rx_array"
             )
         parts = [part for item in live.objects.values() for part in _objects(item)]
         # Names become file names.
@@ -241,7 +241,7 @@ def _vector(value: Any) -> NDArray[np.float64]:
 
 
 LARGEST_DIFFERENCE_DB: Final = 0.01
-"""Largest path-loss difference of traces that count as equal [dB]; the constants in the file are rounded."""
+"""Largest difference in path loss between traces that count as equal [dB]; the constants in the file are rounded."""
 
 SAMPLES: Final = 20_000
 """Number of rays for the comparison; both scenes use the same rays."""
