@@ -311,9 +311,9 @@ def test_calls_of_a_changed_program_are_used_again_with_a_warning(tmp_path, capl
     program.write_text(text)
     loss = engines.make(study, ledger=file).path_loss(CANDIDATES)
     engines.make(study, ledger=file).path_loss(CANDIDATES)
-    assert "changed since" not in caplog.text
+    assert "changed after" not in caplog.text
     program.write_text(text.replace("return 60 +", "return 65 +"))
     assert engines.make(study, ledger=file).path_loss(CANDIDATES).tolist() == loss.tolist()
-    (message,) = [text for text in caplog.messages if "changed since" in text]
-    assert f"{file}: model.py changed since the stored RT calls" in message
+    (message,) = [text for text in caplog.messages if "changed after" in text]
+    assert f"{file}: model.py changed after the RT calls of this study were stored" in message
     assert "use another folder, or delete the ledger" in message

@@ -19,7 +19,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 MOST_DERIVATIVES: Final = 2_000_000
-"""Largest number of derivatives with respect to material constants in one call, which limits memory use."""
+"""Largest number of derivatives with respect to material constants in one call, to limit memory use."""
 
 MAY_TABULATE: Final = 30_000
 """Number of interactions above which coefficients can be taken from tables."""

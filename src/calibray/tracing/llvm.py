@@ -253,7 +253,7 @@ def _refuse_loaded() -> None:
     if loaded[0] < OLDEST_MAJOR:
         state = "without libLLVM" if loaded[0] < 0 else f"with LLVM {loaded[0]}"
         raise InputError(
-            f"Dr.Jit was imported {state} and needs {OLDEST_MAJOR} or newer. Call calibray.tracing.llvm.prepare() "
+            f"Dr.Jit was imported {state} and needs LLVM {OLDEST_MAJOR} or newer. Call calibray.tracing.llvm.prepare() "
             f"before importing sionna.rt, mitsuba or drjit, or set {PATH_VARIABLE}. To install one: {install_command()}"
         )
 

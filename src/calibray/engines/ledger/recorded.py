@@ -154,7 +154,7 @@ class Recorded:
         files, self._unchecked_files = self._unchecked_files, {}
         if files and (changed := self._ledger.changed_program_files(self._problem, files)):
             _LOG.warning(
-                "%s: %s changed since the stored RT calls of this study; these calls are used again. If the "
+                "%s: %s changed after the RT calls of this study were stored; these calls are used again. If the "
                 "change affects their answers, use another folder, or delete the ledger",
                 self._ledger.path, ", ".join(changed),
             )  # fmt: skip

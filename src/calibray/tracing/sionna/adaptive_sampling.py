@@ -44,7 +44,7 @@ QUIET_ROUNDS: Final = 2
 MAX_LAUNCHES: Final = 256
 """Largest number of launches per source: 64 million rays."""
 GEOMETRY_BATCH: Final = 500_000
-"""Largest number of pairs of sequence and receiver whose geometry is computed together, which limits memory use."""
+"""Largest number of pairs of sequence and receiver whose geometry is computed together, to limit memory use."""
 
 _LOG: Final = logging.getLogger(__name__)
 

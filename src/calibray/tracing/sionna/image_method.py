@@ -46,7 +46,7 @@ corners.
 NEAR_PLANE: Final = 0.01
 """Distance from a plane below which a point can be on either side of the plane [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
-"""Largest number of pairs of sequence and receiver that are tested together, which limits memory use."""
+"""Largest number of pairs of sequence and receiver that are tested together, to limit memory use."""
 
 
 class Surfaces:

@@ -168,7 +168,7 @@ def _check_precision(objects: Iterable[MeshObject]) -> None:
             f"{fault}; move the origin into the scene and load it again, or write a study file for its scene file"
         )
     if step > COARSE:
-        _LOG.warning("%s: path loss may change by hundredths of a dB; move the origin into the scene", fault)
+        _LOG.warning("%s: path loss may be off by hundredths of a dB; move the origin into the scene", fault)
 
 
 def _material(material: Any) -> Material:

@@ -48,7 +48,7 @@ def load_scene(scene: Scene) -> rt.Scene:
     step = max((size.step for size in scene.sizes), default=0.0)
     if step > COARSE:
         _LOG.warning(
-            "%s stores coordinates in steps of %g m, because it is far from the origin: path loss may change by "
+            "%s stores coordinates in steps of %g m, because it is far from the origin: path loss may be off by "
             "hundredths of a dB; export meshes with coordinates of type double", scene.path, step,
         )  # fmt: skip
     return loaded

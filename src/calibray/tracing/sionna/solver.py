@@ -116,7 +116,7 @@ class Solver:
         return other
 
     def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
-        """Set the constants of Sionna's materials, as given or otherwise from the scene, and return all constants."""
+        """Set the constants of Sionna's materials, as given or else from the scene, and return all constants."""
         for name in materials:
             check_material_name(name, self.scene.materials, "materials")
         constants = {**self.scene.materials, **materials}
