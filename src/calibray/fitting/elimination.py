@@ -178,7 +178,7 @@ class Arrowhead:
         blocks: The g diagonal blocks [g, b, b].
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].
-        dependent: Components with a column that is zero or a linear combination of the preceding columns [q]; the
+        dependent: Mask of the components whose column is zero or a linear combination of the preceding columns [q]; the
             blocks precede the border. The matrix includes a small prior on these components. They are therefore zero
             unless the bounds prevent the other components from reaching the minimum.
     """

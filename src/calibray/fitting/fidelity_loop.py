@@ -34,9 +34,9 @@ def retrace(
     `progress` is "checking".
 
     Returns:
-        The problem of the last calibration, its search, and the gap of every link [L], [dB]; the gap is None if the
-        paths were not traced again. It is the path loss on paths traced with the calibrated materials minus that on the
-        paths of the calibration.
+        The problem of the last calibration, its search, and the gap of every link [L], [dB]: path loss on paths traced
+        with the calibrated materials minus path loss on the paths of the calibration. The gap is None if the paths were
+        not traced again.
     """
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine

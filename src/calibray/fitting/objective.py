@@ -187,7 +187,8 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that the links determine; under a prior, only the links' share of the precision.
+        """Number of coefficients that the links determine; each with a prior counts as the links' share of its
+        precision.
 
         Coefficients that their priors hold at zero explain no residuals, regardless of the number of groups.
         """
@@ -270,8 +271,8 @@ class Objective:
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Squares and products of residuals and their derivatives, from sums over all links.
 
-        They are the products of the k columns [derivatives, -residuals], including rows of priors [n, k, k], and the
-        sum of squares of the links only [n], [dB^2].
+        The results are the products of the k columns [derivatives, -residuals], including rows of priors [n, k, k], and
+        the sum of squares over the links only [n], [dB^2].
 
         Raises:
             EngineError: No minimum of the nuisance within its bounds was found.

@@ -1,4 +1,4 @@
-"""Fits before the calibration: selection of links near the noise floor, and estimates of the noise and of spreads.
+"""Fits before the calibration: they leave out links near the noise floor, and estimate the noise and spreads.
 
 Near the noise floor, a link is received only if its error is favourable. A selection by measured values keeps these
 links and biases the fit. A selection by predicted values does not, because the prediction is independent of the link's
@@ -44,9 +44,9 @@ MARGIN: Final = 8.0
 Position errors make paths appear and vanish, which gives the errors heavy tails; a margin of four leaves some bias."""
 
 SMALL_MARGIN: Final = 4.0
-"""Margin used if `MARGIN` leaves fewer links per unknown than `LINKS_PER_UNKNOWN`, or an offset without links. With
-errors of 5.5 dB over a range of 35 dB, a slope is 12 % too low if all links are kept, and 2 % too high (standard error
-2 %) with this margin."""
+"""Margin used if `MARGIN` leaves fewer than `LINKS_PER_UNKNOWN` links per unknown, or no links that determine an
+offset. With errors of 5.5 dB over a range of 35 dB, a slope is 12 % too low if all links are kept, and 2 % too high
+(standard error 2 %) with this margin."""
 
 SELECTIONS: Final = 4
 """Largest number of selections."""
@@ -284,7 +284,7 @@ def group_spread(
         residuals: Residuals of the links [n].
         design: Columns X of the other fitted terms, with the derivatives of the model [n, k].
         column: The column [n].
-        group: Group of every link [n], from 0.
+        group: Index of each link's group [n].
 
     Returns:
         The standard deviations.

@@ -1,4 +1,4 @@
-"""Identifies an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
+"""Find an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
 
 Materials are added one at a time. Each material is scanned (`ray_scan.py`) on paths without materials that are added
 later. Least squares with exact derivatives on all these paths then refines the best points, for several polarizations,
@@ -129,7 +129,7 @@ def understand(
 def half_spaces(fit: Understanding, calls: list[Call]) -> tuple[str, ...]:
     """Materials whose assumed thickness the ratios of the calls do not determine, as with half-spaces.
 
-    With a half-space in place of the slab, the misfit then increases by at most `EXACT_DB`.
+    If a half-space replaces the slab of such a material, the misfit increases by at most `EXACT_DB`.
     """
     last, ratios = calls[-1], ratios_of(calls)
     if not ratios:
@@ -236,7 +236,7 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """Mask of the materials on each path [P, M]; materials with a parameter, those alone on the most paths first."""
+    """Mask of the materials on each path [P, M], and the materials with a parameter, alone on the most paths first."""
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True

@@ -69,7 +69,7 @@ CHANGED_DB: Final = 0.5
 
 SEARCHES: Final = 4
 """Number of local searches relative to a calibration by replay; a call costs more than many searches. In a district
-with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower with two of five seeds; 2,048
+with 557 interactions, 512 and 1,024 searches with two of five seeds missed a minimum that is 0.076 dB lower; 2,048
 searches found it with all five."""
 
 LEAST_CALLS: Final = 3
@@ -125,7 +125,7 @@ class RayMap:
     def understood(self) -> bool:
         """Whether the optimum is reached, the model explains all calls, and the calls share their strong paths.
 
-        Its replay then represents the engine at other candidates as well. Ratios of paths without a calibrated material
+        The replay then represents the engine at other candidates as well. Ratios of paths without a calibrated material
         are 1 with any model, so they explain nothing.
         """
         model = self.understanding.model

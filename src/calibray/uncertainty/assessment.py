@@ -45,19 +45,19 @@ from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterio
 from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_intervals, verdicts, with_reason
 
 LARGEST_ERROR: Final = 0.5
-"""Largest error of the emulator at left-out calls, relative to the RMSE of the best call, for which intervals are
-drawn. With larger errors, candidates near a call fit better only because the emulator is exact there. Without this
-limit, the sets of parameters called identified or weakly identified contained 2 of 7 true values with 2 calls per
-parameter, and 14 of 14 with 8 or 16 (docs/measurements/intervals.md)."""
+"""Intervals are drawn if the emulator's error at left-out calls is at most this share of the best call's RMSE. With
+larger errors, candidates near a call fit better only because the emulator is exact there. Without this limit, the
+intervals of parameters judged identified or weakly identified contained 2 of 7 true values with 2 calls per parameter,
+and 14 of 14 with 8 or 16 (docs/measurements/intervals.md)."""
 
 NEGLIGIBLE_DB: Final = 0.05
-"""Error of an emulator that is always accepted [dB]; path loss is not measured more precisely."""
+"""An emulator error up to this value is always accepted [dB]; path loss is not measured more precisely."""
 
 DRAWS_PER_CALL: Final = 40
-"""Evaluations for larger populations of draws, per call of the calibration, if small populations disagree. A call with
-derivatives takes as long as 10 to 16 of these evaluations. In 24 runs in districts 100 to 106, populations of 64
-members disagreed in 8. With 256 members instead, the share of the posterior in the worst 90 % set rose from 0.76 to
-0.80, on average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
+"""Number of evaluations, per call of the calibration, that larger populations may use if small populations disagree. A
+call with derivatives takes as long as 10 to 16 of these evaluations. In 24 runs in districts 100 to 106, populations of
+64 members disagreed in 8. With 256 members instead, the share of the posterior that the worst 90 % set contains rose
+from 0.76 to 0.80, on average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
 
 EQUAL: Final = 0.1
 """If the drawn emulators differ from their mean by less than this share of the lowest objective, only the mean is
@@ -77,7 +77,7 @@ MAX_COLUMNS: Final = 100
 
 SHOWN_DIFFERENCE: Final = 0.1
 """The credible set for the measured buildings is reported if it differs from the set for all buildings over more than
-this share of the range that both span."""
+this share of the range that the two sets span together."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
 """Usual widths of parameter ranges: building materials have permittivities between 2 and 12, and conductivities that
@@ -240,7 +240,7 @@ def _assess(
 
 
 def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None, calls: int) -> Posterior:
-    """Draw from the posterior of every model, after a calibration with a number of calls."""
+    """Draw from the posterior of every model; `calls` is the number of RT calls of the calibration."""
     parts = []
     for number, model in enumerate(models):
 
@@ -271,7 +271,7 @@ def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> 
 def _intervals(
     problem: Problem, model: JointModel, posterior: Posterior, local: dict[str, Interval]
 ) -> dict[str, Interval]:
-    """Interval and verdict by parameter."""
+    """Interval and verdict of each parameter."""
     parameters, counted = problem.parameters, problem.objective.weight > 0
     lower, upper = parameters.search_bounds
 
@@ -309,7 +309,7 @@ def _intervals(
 
 
 def _differ(verdict: JudgedSet) -> bool:
-    """Whether the sets for measured and for all buildings differ over more than a tenth of the range that both span."""
+    """Whether the sets for measured and for all buildings differ over more than a tenth of their common hull."""
     both = (np.array(verdict.pieces), np.array(verdict.seen))
     line = np.linspace(min(each.min() for each in both), max(each.max() for each in both), 1000)
     one, other = (((each[:, :1] <= line) & (line <= each[:, 1:])).any(axis=0) for each in both)
@@ -386,7 +386,7 @@ def _effective(weight: NDArray[np.float64]) -> float:
 
 
 REPEAT_M: Final = 0.01
-"""Largest distance between the ends of rows that count as repeats of a link [m]; antennas are larger."""
+"""Largest distance between the ends of two rows that count as repeats of one link [m]; antennas are larger."""
 
 REPEAT_DB: Final = 0.1
 """Largest difference in modelled path loss between such rows [dB]; a different antenna or carrier changes it by
@@ -401,8 +401,8 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     shared error. If the rows agree closely, a noise model with one variance for scatter and shared error would
     underestimate the shared error.
 
-    Rows repeat a link if they have the same end positions, nuisances and biases, and if their modelled path loss is the
-    same for both the initial values and the best candidate. The first row is assigned the mean path loss, the mean
+    Rows repeat a link if they have the same end positions, nuisances and biases, and if their modelled path losses
+    agree, both at the initial values and at the best candidate. The first row is assigned the mean path loss, the mean
     weight and the means of further observables. The other rows are assigned a weight of 0.
 
     Args:

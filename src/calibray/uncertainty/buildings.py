@@ -38,9 +38,9 @@ MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
 
 WEAK: Final = 0.1
-"""Largest share of a link's power that all omitted paths together carry, summed over 16 candidates. On an office floor
-in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05 dB (RMS); the
-errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
+"""Largest share of a link's power, summed over 16 candidates, that all omitted paths together may carry. On an office
+floor in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05 dB
+(RMS); the errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
 
 EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
 """Fields of parameters that are exponents of laws of frequency."""
@@ -75,11 +75,11 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class Split(ABC):
-    """A replay with candidates that set further constants in addition to the study's parameters.
+    """A replay whose candidates set further constants in addition to the study's parameters.
 
     Attributes:
         parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
-        building_of: Building of each constant, numbered from 0; -1 for other objects, such as the ground [c].
+        building_of: Index of each constant's building; -1 for other objects, such as the ground [c].
         met: Indices of the buildings that the paths meet.
         interactions: Number of interactions that are evaluated for a candidate.
     """
@@ -248,12 +248,12 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
 def _split_paths(
     radio: RadioSettings, replay: Replay, paths: Paths, building: NDArray[np.int64], parameters: Parameters
 ) -> tuple[Replay, list[tuple[int, int]]]:
-    """The replay of one carrier with the given paths; and for each constant, its parameter and its building (-1: none).
+    """The replay of one carrier with the given paths, and the parameter and building (-1: none) of each constant.
 
     If the paths depend on no constant, the replay is unchanged and the list is empty.
     """
     names = list(paths.materials)
-    # One material per pair of building and material, numbered by the sorted pairs.
+    # One material per pair of building and material, in the order of the sorted pairs.
     pairs, split_material = np.unique((building + 1) * len(names) + paths.material, return_inverse=True)
     number, original = (pairs // len(names) - 1).tolist(), [names[k] for k in pairs % len(names)]
     split_names = [f"{name} of {of}" for name, of in zip(original, number, strict=True)]

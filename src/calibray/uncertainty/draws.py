@@ -27,7 +27,7 @@ class Draws:
 
 
 def pooled(draws: Sequence[Draws]) -> Draws:
-    """Draws from the mean of several posteriors, each with the same weight."""
+    """Draws from a mixture of several posteriors with equal weights."""
     return Draws(
         np.concatenate([each.point for each in draws]),
         np.concatenate([each.density for each in draws]),

@@ -319,7 +319,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with nonzero weight; if there are too many, mainly the best of them."""
+    """The calls in which every link with nonzero weight has a path loss; at most `MAX_CALLS`, most of them the best."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

@@ -11,8 +11,8 @@
 `sequential_monte_carlo.py` draws from the posterior.
 
 Under Gaussian noise, correlated or not, the density with noise level and nuisance integrated out is a power of a
-quadratic form of the gaps. Its matrix is computed once, unless there are many links. Under heavy tails, gaps with and
-without an offset are evaluated together.
+quadratic form of the gaps. The matrix of this form is computed once, unless there are many links. Under heavy tails,
+gaps with and without an offset are evaluated together.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MAX_LINKS: Final = 300
 
 @dataclass(frozen=True, eq=False)
 class QuadraticForms:
-    """A marginal density prepared for gaps that have one noise model each.
+    """A marginal density, prepared for gaps that each have their own noise model.
 
     Attributes:
         marginal: The density.
@@ -128,9 +128,9 @@ class JointModel:
         loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
         parameter_of: Index of the parameter to which each of the c constants of single buildings belongs [c].
-        building_of: Building of each of these constants, numbered from 0 [c].
-        only_buildings: Indices of the parameters whose constants all belong to buildings, so that the buildings alone
-            determine the mean.
+        building_of: Index of the building of each of these constants [c].
+        only_buildings: Indices of the parameters whose constants all belong to buildings; the buildings alone determine
+            the mean.
         spread: The between-building spread if the study declares it; otherwise None.
         interactions: Number of interactions per evaluation.
         effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
@@ -248,7 +248,7 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    # Few links cannot distinguish noise models, or show that buildings differ: only what the study states is used.
+    # Too few links cannot tell noise models apart or show that buildings differ, so only what the study states is used.
     few = len(counted) < FEW
     # With correlated errors, the probability of censoring would be an integral over all censored links together.
     uncorrelated = bool(censored.any()) or (few and section.range_m == "auto")

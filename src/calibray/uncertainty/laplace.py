@@ -30,7 +30,7 @@ CENSORED_TOLERANCE: Final = 1e-9
 
 LARGEST: Final = 1e4
 """Largest magnitude of a censored link's error, in units of the median absolute error. Without this limit, the error of
-a link without a path would be infinite."""
+a censored link without a path would be infinite."""
 
 
 class _Terms(NamedTuple):
@@ -42,7 +42,7 @@ class _Terms(NamedTuple):
 
 
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
-    """Log probability that a Student's t variable exceeds an error; it is Gaussian if `freedom` is infinite.
+    """Log probability that a Student's t variable exceeds an error; a Gaussian variable if `freedom` is infinite.
 
     Example:
         >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()

@@ -23,7 +23,7 @@ SAMPLES: Final = 128
 """Number of points along each line, several in each cell that it crosses."""
 
 HEIGHTS: Final = (5.0, 10.0, 20.0)
-"""Heights of the rectangles above the lowest antenna [m], for hedges, street trees and tall trees."""
+"""Heights of the rectangles' tops above the lowest antenna [m], for hedges, street trees and tall trees."""
 
 FEWEST_LINKS: Final = 30
 """Smallest number of links for a search."""
@@ -57,12 +57,12 @@ class MissingRegion:
     """A rectangle with an extra loss that would explain part of the residuals.
 
     Attributes:
-        box: West, south, east and north sides in the scene frame [m].
+        box: Coordinates of its west, south, east and north sides in the scene frame [m].
         height: Height of its top in the scene frame [m].
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses it; an estimate if not all links are used.
         share: Share of the mean square of the residuals that it explains.
-        chance: Median share of the mean square of permuted residuals that the best rectangle explains.
+        chance: Share of their mean square that the best rectangle explains for permuted residuals (median).
         significant: Whether at least `FEW` links cross it, and no permutation has a rectangle that explains as much.
     """
 
@@ -157,7 +157,7 @@ def _grid(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[NDArray[np.
 def _lengths(
     tx: NDArray[np.float64], rx: NDArray[np.float64], corner: NDArray[np.float64], cell: float, top: float
 ) -> NDArray[np.float64]:
-    """Length of every line below a height in every cell of the grid [n, cells], [m]."""
+    """Length of the part of every line that is below the height `top` in every cell of the grid [n, cells], [m]."""
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES
     point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
     index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)

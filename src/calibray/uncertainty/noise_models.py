@@ -1,11 +1,12 @@
 """Noise models, and the marginal density of the measurements under each.
 
-Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed. An offset
-may be undeclared. Larger errors out of sight are a discrepancy of the digital twin (M. C. Kennedy and A. O'Hagan, J.
-Royal Statistical Society B 63, 2001): paths that the twin lacks change the path loss of its weak links (`excess_db`).
-The right model is unknown, and a choice of the best-fitting model would ignore others that fit nearly as well. Every
-model therefore has a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy
-that the data do not support receives almost no weight, and does not absorb effects that the parameters explain.
+Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed. There may
+be an undeclared offset. Larger errors out of sight are a discrepancy of the digital twin (M. C. Kennedy and A. O'Hagan,
+J. Royal Statistical Society B 63, 2001): paths that the twin lacks change the path loss of its weak links
+(`excess_db`). The right model is unknown, and choosing the best-fitting model would ignore others that fit nearly as
+well. Every model therefore has a prior weight, and results are averages over all models (Bayesian model averaging). A
+discrepancy that the data do not support receives almost no weight, and does not absorb effects that the parameters
+explain.
 
 The noise level has the prior 1/level. The priors of nuisances are flat unless the study declares them. For Gaussian
 noise with covariance C times an unknown variance, the integrals over noise level and nuisances have closed forms (D. A.
@@ -51,7 +52,8 @@ STRONGEST: Final = 0.05
 def excess_db(problem: Problem) -> NDArray[np.float64]:
     """Excess loss of links out of sight over free space, relative to that of the strongest links [L], [dB].
 
-    It is the median over candidates within the bounds; minus infinity for links in sight, which have a direct path.
+    It is the median over candidates within the bounds; minus infinity for links in sight, which have a direct path, and
+    for links without a path.
     """
     from scipy.stats import qmc  # takes 0.4 s
 
@@ -84,8 +86,8 @@ RANGES: Final = 4
 """Number of correlation ranges tried, from the distance between neighbours to a third of the campaign's extent."""
 
 SAME_PLACE: Final = 0.01
-"""Correlation range of errors that only links at the same position share, relative to the distance between
-neighbours."""
+"""Correlation range, relative to the distance between neighbours, of errors that only links at the same position
+share."""
 
 FREEDOMS: Final = (2.0, 4.0)
 """Trial values of the degrees of freedom of Student's t."""

@@ -3,7 +3,7 @@
 - One or more parameters move along the difference of two other members (C. J. F. ter Braak, Statistics and Computing
   16, 2006).
 - One parameter is redrawn from the smoothed density of its values in the population. Because of reflections inside
-  walls, several narrow ranges of a permittivity can fit; a member can reach any of them in one move.
+  walls, several narrow ranges of permittivity can fit; a member can reach any of them in one move.
 - The constants of one, two or all buildings are redrawn around their current values (S. L. Cotter, G. O. Roberts, A. M.
   Stuart and D. White, Statistical Science 28, 2013).
 - The between-building spread is redrawn from its prior, together with all buildings, which become equal or different.

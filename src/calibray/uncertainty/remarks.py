@@ -37,7 +37,7 @@ SIGNIFICANT: Final = 0.005
 neighbouring links share make small probabilities slightly more frequent."""
 
 UNRELATED: Final = 0.02
-"""An observable is reported as not fitting the scene if the probability of such a small slope under the model is below
+"""An observable is reported as not fitting the scene if the probability of a slope this small under the model is below
 this value, divided by the number of observables."""
 
 FEWEST: Final = 5
@@ -99,7 +99,7 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
 
 
 class Slope(NamedTuple):
-    """Slope of the line of measured versus modelled values of an observable.
+    """Slope of the regression of an observable's measured values on its modelled values.
 
     Attributes:
         name: The observable.
@@ -155,8 +155,8 @@ NOTABLE: Final = 0.25
 """Smallest posterior weight of a kind of noise that is reported; several kinds can share the weight."""
 
 SLACK: Final = 0.02
-"""A calibrated value is reported if its distance from its interval exceeds this share of the range of the search, which
-is logarithmic for a parameter with this scale."""
+"""A calibrated value is reported if its distance from its interval exceeds this share of the search range, which is
+logarithmic for a parameter with a logarithmic scale."""
 
 MISSED_DB: Final = 0.01
 """The method is reported to have missed the optimum if a draw has an objective that is lower by at least this much

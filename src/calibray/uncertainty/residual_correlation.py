@@ -86,7 +86,7 @@ def fit_correlation(
     rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
 
     Raises:
-        InputError: The number of links exceeds the number of columns by less than three, or all receivers share one
+        InputError: The number of links exceeds the number of columns by fewer than three, or all receivers share one
             position.
         EngineError: The errors are all zero.
     """
@@ -220,7 +220,8 @@ def whitener(
 
     The errors have been multiplied by `scale` [m], so that their uncorrelated part has the same variance for all links.
     The correlated part has `share` of the variance, from 0 to below 1, and its covariance falls to 1/e at the distance
-    `range_m` [m]. Up to `exact` links, the covariance is factored exactly. If `neighbours` is None, they are computed.
+    `range_m` [m]. For up to `exact` links, the covariance is factored exactly. If `neighbours` is None, they are
+    computed.
     """
     count = len(position)
     if count <= exact:
@@ -232,7 +233,8 @@ def whitener(
 def shared(error: NDArray[np.float64], share: float) -> Whitener:
     """The whitener of errors of unit variance plus further errors with the standard deviations `error` [m].
 
-    All links have `share` of the further variance in common. For more than `EXACT` links, errors count as independent.
+    All links have `share` of the further variance in common. For more than `EXACT` links, errors are treated as
+    independent.
     """
     if len(error) > EXACT:
         variance = 1.0 + error**2

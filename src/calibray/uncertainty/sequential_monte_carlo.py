@@ -6,7 +6,7 @@ the population is effective, resamples the population, and moves its members (`p
 
 We start with two independent populations, and double their number as long as the two halves of the populations disagree
 and the budget allows it. If they agree, each population is weighted by its estimate of the evidence, which is unbiased.
-Small populations that disagree are replaced by larger ones if the calibration took long enough.
+Small populations that disagree are replaced by larger ones if the calibration made enough RT calls.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Posterior:
 
 
 def joined(posteriors: Sequence[Posterior]) -> Posterior:
-    """Draws from the mean of several posteriors with equal weights."""
+    """Draws from a mixture of several posteriors with equal weights."""
     return Posterior(
         pooled([each.means for each in posteriors]),
         pooled([each.seen for each in posteriors]),
@@ -142,9 +142,9 @@ def draw_posterior(
 ) -> Posterior:
     """Draw from the joint posterior.
 
-    `progress` is called with the share of the work done after every step. The budget is the number of interactions that
-    may be evaluated; it is shared between the models if the draws of several models are pooled. If populations disagree
-    and are small because of the budget, larger ones are drawn with the largest budget instead.
+    After every step, `progress` is called with the share of the work done. The budget is the number of interactions
+    that may be evaluated; it is shared between the models if the draws of several models are pooled. If populations
+    disagree and are small because of the budget, larger ones are drawn with the largest budget instead.
     """
     posterior = _draw_populations(model, seed, progress, budget, models)
     sizes = [population_size(model.interactions, each, models) for each in (budget, largest_budget)]

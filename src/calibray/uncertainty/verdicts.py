@@ -351,7 +351,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval; an identified verdict becomes ambiguous if the interval excludes the calibrated value."""
+    """The interval, with an ambiguous verdict instead of an identified one if it excludes the calibrated value."""
     identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
