@@ -138,7 +138,7 @@ class Segments:
 
     Attributes:
         order: Order in which the numbers are added, whole blocks first [n]; None if the order is unchanged.
-        segment: Segment of every block, then of every remaining number [blocks + n - BLOCK x blocks].
+        segment: Index of the segment of every block, then of every remaining number [blocks + n - BLOCK x blocks].
         blocks: Number of whole blocks.
         count: Number of segments.
     """

@@ -140,7 +140,7 @@ def path_losses(
 
     Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
     candidate, material and mode [count, M, 3]; it is zero without tables. Only the first `count` candidates are
-    evaluated. The function is compiled for a batch of n, so that a partly filled batch needs no new compilation.
+    evaluated. The function is compiled for a batch of n, so a partly filled batch needs no new compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):

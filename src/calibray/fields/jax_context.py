@@ -2,8 +2,8 @@
 
 Outside Calibray's calls, the user's settings apply.
 
-Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes.
-A compiled program is machine code, so it is read only from a folder that nobody but the user can write to
+Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes. A
+compiled program is machine code, so Calibray reads it only from a folder to which no one but the user can write
 (`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them.
 Calibray uses JAX's keys, which include everything on which a program depends, but reads and writes entries through its
 own store. If the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder instead.

@@ -202,7 +202,7 @@ def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
 
 
 def _normalization(alpha: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
-    """F_alpha [D], the integral of a lobe over the half space (eqs. 7 and 8 of the paper), for exponents alpha [M].
+    """F_alpha [D], the integral of a lobe over the half space (eqs. 7 and 8 of Degli-Esposti), for exponents alpha [M].
 
     The integral is interpolated linearly between integer exponents. Above `LARGEST_EXPONENT`, ((1 + cos psi) / 2)^alpha
     is nearly exp(-alpha psi^2 / 4), and the plane of the surface truncates its tail.

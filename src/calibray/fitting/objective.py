@@ -187,8 +187,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that the links determine; each with a prior counts as the links' share of its
-        precision.
+        """Number of coefficients that the links determine, each weighted by the links' share of its precision.
 
         Coefficients that their priors hold at zero explain no residuals, regardless of the number of groups.
         """
