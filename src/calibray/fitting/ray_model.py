@@ -99,8 +99,7 @@ class RayModel:
 
     @cached_property
     def assumed(self) -> tuple[tuple[str, str], ...]:
-        """Material and field of every assumed constant: uncalibrated, nonzero, and of a nonmetal on at least one
-        path."""
+        """Material and field of every assumed constant: uncalibrated, nonzero, of a nonmetal on at least one path."""
         calibrated = {(item.material, item.constant) for item in self.parameters}
         met = set(np.unique(self.paths.material).tolist())
         return tuple(

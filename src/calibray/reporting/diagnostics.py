@@ -167,7 +167,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
 
 @lru_cache(maxsize=4)
 def _searched(rows: bytes) -> MissingRegion | None:
-    """The missing region, cached for a second use; each of `rows` has a link's ends, excess loss and obstruction."""
+    """The missing region, cached for a second use; `rows` holds the ends, excess loss and obstruction of each link."""
     links = np.frombuffer(rows).reshape(-1, 8)
     return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 
@@ -200,7 +200,7 @@ def _power(result: Record) -> pd.DataFrame:
 
 
 def _trade_offs(result: Record) -> pd.DataFrame:
-    # An unknown that is the same in all draws has no correlation.
+    # The correlation with an unknown that is the same in all draws is undefined.
     names = [name for name, values in result.uncertainty.draws.items() if np.ptp(values) > 0]
     if not 2 <= len(names) <= MOST_UNKNOWNS:
         return pd.DataFrame()

@@ -153,7 +153,7 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
-    """One row per material: its constants in predictions, and interval and verdict of each calibrated constant."""
+    """One row per material: the constants that predictions use, and the interval and verdict of each calibrated one."""
     names = exported_names(result.scene_materials)
     for name, material in result.scene_materials.items():
         row: dict[str, Any] = {"material": name, "scene_name": names[name]}

@@ -155,7 +155,7 @@ def ramp_limit(value: NDArray[np.float64]) -> float:
 
 
 def _round(value: float, up: bool = False) -> float:
-    """The largest number of the series 1, 2, 5, 10, ... up to a value or, with `up`, the smallest from the value on."""
+    """The largest number of the series 1, 2, 5, 10, ... not above a value or, with `up`, the smallest not below it."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
     # A rounding error above a step must not lead to the next one.
@@ -213,7 +213,7 @@ def save_positions(
     inputs: Iterable[Path] = (),
     overwrite: bool = False,
 ) -> None:
-    """Draw a plan of the scene with the antennas into a file.
+    """Draw a plan of the scene and the antennas, and save it to a file.
 
     Args:
         file: The file, .png, .svg or .pdf.
@@ -236,7 +236,7 @@ def save_positions(
 
 @styled()
 def draw_positions(source: str | Path, tx: ArrayLike, rx: ArrayLike) -> Figure:
-    """Draw a plan of the scene with the antennas; the arguments are those of `save_positions`.
+    """Draw a plan of the scene and the antennas; the arguments are those of `save_positions`.
 
     Raises:
         InputError: The scene cannot be read.

@@ -368,7 +368,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
     links = data.links
     if links is None or layout is None:
         return None
-    # Links store the number of their group, which takes less space than its name.
+    # Links store the index of their group, which takes less space than its name.
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
     materials = [] if data.scene is None else list(data.scene.materials)

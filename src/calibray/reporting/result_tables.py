@@ -153,7 +153,7 @@ def remarks(result: Record) -> Table:
 def nuisances(result: Record) -> Table:
     """Offsets and the coefficients of further nuisances, by group; no rows if the study declares no nuisance.
 
-    If the posterior draws contain them, a further column has their standard deviations.
+    If the posterior draws contain them, a further column shows their standard deviations.
     """
     nuisance, others = result.nuisance, _nuisances_besides_offset(result)
 

@@ -57,7 +57,7 @@ class Sentence:
 def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
     """Summarize a calibration in a few sentences: model for predictions, fit, benefit, certainty, advice and warnings.
 
-    `links_by_material` is the number of links with a path that interacts with the material; None without paths.
+    `links_by_material` is the number of links with a path that interacts with each material; None without paths.
     """
     return (
         Sentence("What do predictions use?", f"{prediction_text(result)} {scene_alone_text(result)}".strip()),

@@ -201,7 +201,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
 def residuals_by_direction(result: Record) -> Figure | None:
     """Draw the residuals of links versus direction from their transmitter, with its antenna pattern on the horizon.
 
-    The result is None if the study does not state the mounting of transmitters, or its links cannot be read or have
+    The result is None if the study does not state the mounting of transmitters, or if its links cannot be read or have
     changed.
     """
     study = result.study

@@ -34,7 +34,7 @@ def load() -> rt.Scene:
     scene = rt.load_scene(str(FOLDER / "scene.xml"))
     scene.frequency = CALIBRATION["frequency_hz"]
     for name, pattern in CALIBRATION["scattering_patterns"].items():
-        # Scene files can only contain the Lambertian pattern.
+        # Scene files can contain only the Lambertian pattern.
         scene.radio_materials[name].scattering_pattern = scattering_pattern_registry.get(pattern.pop("name"))(
             **pattern
         )
