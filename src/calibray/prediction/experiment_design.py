@@ -187,7 +187,7 @@ def choose_candidates(
 def initial_range_probability(piece: NDArray[np.int64]) -> NDArray[np.float64]:
     """Probability [d] that two draws lie in the same range of a parameter, before any candidate is measured.
 
-    `piece` numbers the ranges in which the draws lie [n, d].
+    `piece` is the index of the range in which each parameter of each draw lies [n, d].
     """
     return _range_probability(piece, np.zeros((len(piece), len(piece))))
 
@@ -202,9 +202,9 @@ def separation_probability(
 
     The probability is averaged over draws and parameters; a parameter with a single range contributes 0. `excess` is
     the sum of squares of every value minus the smallest sum, in noise variances [m]; the first n values are the draws.
-    `piece` is the range of each parameter [m, d]. `squares` are squared differences between draws and values at the
-    candidates chosen so far [n, m]. `predicted` is the candidates' path loss for every value, in standard deviations of
-    their errors [m, candidates].
+    `piece` is the index of each parameter's range [m, d]. `squares` are squared differences between draws and values at
+    the candidates chosen so far [n, m]. `predicted` is the candidates' path loss for every value, in standard
+    deviations of their errors [m, candidates].
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]

@@ -162,7 +162,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
     rows, columns = coverage.z.shape
     layout = {"width": columns, "height": rows, "count": len(bands), "dtype": "float32", "nodata": np.nan}
     compressed = {"driver": "GTiff", "compress": "deflate", "predictor": 3}
-    # GDAL only accepts file names in UTF-8, so the file is made in memory.
+    # GDAL accepts only file names in UTF-8, so the file is made in memory.
     with rasterio.MemoryFile() as memory:
         with memory.open(**compressed, **layout, **georeference) as file:
             for number, (name, values) in enumerate(bands.items(), start=1):

@@ -53,7 +53,7 @@ NEIGHBOURS: Final = (0.125, 0.5)
 m."""
 
 NEAR_SHARE: Final = 0.1
-"""Share of the residual field's variance explained by measured links above which a link counts as near them."""
+"""A link counts as near measured links if they explain more than this share of the residual field's variance."""
 
 WEAKER_DB: Final = 10.0
 """Excess over the largest calibrated path loss above which a prediction has a remark [dB]. In a synthetic town with

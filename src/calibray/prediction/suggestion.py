@@ -175,7 +175,7 @@ def _received(
     reached: NDArray[np.int64],
     margin_db: float,
 ) -> NDArray[np.int64]:
-    """The candidates of `reached`, which have a path, whose predicted power exceeds the noise floor by the margin.
+    """The candidates in `reached` (those with a path) whose predicted power exceeds the noise floor by the margin.
 
     All of `reached` is returned if the study has no noise floor, or if the candidates' transmitted power is unknown.
 

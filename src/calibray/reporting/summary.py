@@ -155,7 +155,7 @@ def _certainty(result: Record) -> Iterator[Sentence]:
 
 
 def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iterator[Sentence]:
-    heading = "What to measure next?"
+    heading = "What should be measured next?"
     unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
     owners = dict.fromkeys(name.rpartition(".")[0] for name in unidentified)
     # Paths do not interact with the owners of other parameters, such as antennas.

@@ -62,8 +62,7 @@ class Rays:
 
 
 def with_stored_paths(result: Record, ledger: Path) -> Record:
-    """A result with the paths in its ledger, from the call at the calibrated values or, failing that, the initial
-    values.
+    """A result with the paths in its ledger, from the call at the calibrated values or else the initial values.
 
     The result is unchanged if its engine returns no rays, the study can no longer be opened, or its scene and links do
     not belong to a call in the ledger.

@@ -207,8 +207,8 @@ def averaged_terms(
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
     """The terms of the log-distance model with obstruction, with the mean of the prior added to the loss out of sight.
 
-    The fit treats that mean as known, even if no link out of sight has a weight. A nuisance that the study declares for
-    the same column has no such prior.
+    The fit treats that mean as known, even if no link out of sight has a nonzero weight. A nuisance that the study
+    declares for the same column has no such prior.
     """
     if any(term.by == OUT_OF_SIGHT for term in study.nuisance.values()):
         return terms
