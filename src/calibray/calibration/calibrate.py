@@ -163,7 +163,7 @@ def calibrate(
         validation = validate_problem(problem, progress=progress, known_minima=starts)
     start_stage(progress, "examining residuals")
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
-    # A wrong direction looks like a loss on one side of a transmitter, so regions are tested last.
+    # A wrong direction looks like a loss on one side of a transmitter, so regions are tested only if directions fit.
     on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)
     on_links += groups_remark(problem, trail)
     remarks = (*given_engine_remark(setup, given), *of_rays, *on_links)

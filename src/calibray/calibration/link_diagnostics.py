@@ -323,8 +323,8 @@ FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
 """Smallest number of links of a transmitter for which its direction, which has two angles, is tested."""
 
 MOST: Final = 50
-"""Largest number of transmitters that are tested, those with the most links; each requires three derivatives of all
-links."""
+"""Largest number of transmitters that are tested; those with the most links are chosen. Each requires three derivatives
+of every link."""
 
 
 class Direction(NamedTuple):
@@ -363,7 +363,8 @@ def _excess_db(problem: Problem, trail: Trail) -> NDArray[np.float64]:
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     """Test whether the groups of a column without a nuisance, such as devices, explain the residuals of a calibration.
 
-    Labels are text, carriers, or a few whole numbers that do not correlate with path loss, as signal levels would.
+    Labels are text, carriers, or a few whole numbers. Numbers that correlate with path loss are taken for signal
+    levels.
     """
     setup, links = problem.setup, problem.setup.links
     if not isinstance(links, Measurements):
@@ -451,7 +452,8 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """Evaluation with derivatives by the transmitters' directions and gains, and each parameter's column by name."""
+    """The evaluation, with derivatives for the transmitters' directions and gains, and each parameter's column by
+    name."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}

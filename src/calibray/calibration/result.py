@@ -123,12 +123,12 @@ class Result(Record):
 
         Returns:
             One row per link, with the index of the table: path_loss_db, lower_db and upper_db [dB]; the same three in
-            the measured quantity if that is not path loss; basis, the source of the interval; and remark, a warning
-            about an unlikely antenna position.
+                the measured quantity if that is not path loss; basis, the source of the interval; and remark, a warning
+                about an unlikely antenna position or an unusually weak link.
 
         Raises:
-            InputError: An error of `predict` other than an unknown group; the level is not between 0 and 1; or the
-                calibration had too few links to estimate the size of residuals.
+            InputError: `predict` would refuse the links for a reason other than unknown groups; the level is not
+                between 0 and 1; or the calibration had too few links to estimate the size of residuals.
         """
         from calibray.prediction.predict import predict_interval
 

@@ -51,7 +51,7 @@ OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
 
 WALL_DB: Final = 2.0
 """Standard deviation of the zero-mean prior for the loss per wall crossed [dB]. Indoors, the loss of walls dominates
-with any prior. Outdoors, waves travel around buildings; with 5 dB, the error on one held-out cluster of Boulder was 17
+with any prior. Outdoors, waves travel around buildings; with 5 dB, the error on one held-out cluster in Boulder was 17
 dB."""
 
 ROUNDS: Final = 4
@@ -212,8 +212,8 @@ PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with a prior."""
 
 OFFSET_PRIOR_DB: Final = 10.0
-"""Standard deviation of the priors around zero of a transmitter's offset, relative to the offset of all links, and of
-the offset of links out of sight [dB]. In downtown Boulder, the latter offset is 11.7 dB."""
+"""Standard deviation of the zero-mean priors of two offsets: that of a transmitter, relative to the offset of all
+links, and that of links out of sight [dB]. In downtown Boulder, the latter offset is 11.7 dB."""
 
 MOST_STARTS: Final = 4
 """Largest number of known minima from which a search starts."""
@@ -225,8 +225,8 @@ MOST_NEW_STARTS: Final = 128
 """Largest number of starting points if no minimum is known."""
 
 TOLERANCE: Final = 1e-6
-"""Relative decrease of the mean square below which a search has converged; further iterations change predictions by
-less."""
+"""Relative decrease of the mean square below which a search has converged; further iterations hardly change
+predictions."""
 
 NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 

@@ -127,7 +127,8 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """A sentence on the improvement of calibration over the best baseline, if any, and on its certainty."""
+        """A sentence that states how much the calibration improves on the best baseline, if at all, and how certain
+        this is."""
         return judgement_text(self.judgement)
 
     @property
@@ -142,7 +143,8 @@ class Validation(HeldOutErrors):
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Standard deviations of a model's held-out residuals within and between blocks; None for too few links."""
+        """Standard deviations of a model's held-out residuals within and between blocks; None for too few blocks or
+        links."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
