@@ -452,8 +452,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """The evaluation, with derivatives for the transmitters' directions and gains, and each parameter's column by
-    name."""
+    """The evaluation, with derivatives for the transmitters' directions and gains, and each parameter's column."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}

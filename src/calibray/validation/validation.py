@@ -127,8 +127,7 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """A sentence that states how much the calibration improves on the best baseline, if at all, and how certain
-        this is."""
+        """A sentence that states how much the calibration improves on the best baseline, and how certain this is."""
         return judgement_text(self.judgement)
 
     @property
@@ -143,8 +142,7 @@ class Validation(HeldOutErrors):
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Standard deviations of a model's held-out residuals within and between blocks; None for too few blocks or
-        links."""
+        """Standard deviations of a model's held-out residuals within and between blocks; None for too few of them."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
