@@ -196,7 +196,7 @@ def test_the_colours_of_a_map_end_at_quantiles(shadowed: Result) -> None:
     assert (low, high) == pytest.approx(np.quantile(loss, [0.02, 0.98]), abs=0.01)
     (bar,) = picture.axes[1:]
     assert f"colours: {low:.3g} to {high:.3g} (2 % to 98 % quantile)" in bar.get_ylabel()
-    assert "values outside have the end colour" in bar.get_ylabel()
+    assert "values outside take the end colours" in bar.get_ylabel()
     # Neither end of the label is cut off.
     bar.figure.draw_without_rendering()
     label, page = bar.yaxis.label.get_window_extent(), bar.figure.bbox

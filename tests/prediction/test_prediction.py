@@ -112,7 +112,7 @@ def test_a_table_with_the_columns_of_the_measurements_is_predicted(tmp_path):
     for wrong, message in (
         ("new.csv", "links: is a str, must be a pandas DataFrame, such as pandas.read_csv"),
         (own_columns.to_numpy(), r"links: is a numpy\.ndarray, must be a pandas DataFrame"),
-        (pd.concat([own_columns, own_columns], axis=1), "links: has several columns 'east'; keep one"),
+        (pd.concat([own_columns, own_columns], axis=1), "links: several columns are named 'east'; keep one"),
     ):
         with pytest.raises(InputError, match=message):
             result.predict(wrong)

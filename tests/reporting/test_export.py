@@ -116,7 +116,7 @@ def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_mat
     assert sampling_text(result) == ""
     unchecked = replace(result, fit=replace(result.fit, retrace_gap_db=None))
     assert "depends on the materials" in sampling_text(unchecked)
-    assert sampling_text(unchecked).endswith("load_scene.py prints the difference of every link.")
+    assert sampling_text(unchecked).endswith("load_scene.py prints the difference for every link.")
     for section, stated in (
         ("links", {"tx_antenna": {"azimuth_deg": 0.0}}),
         ("antennas", {"tx": {"pattern": "sector.msi"}}),

@@ -134,13 +134,13 @@ class CoverageMap:
                 geotiff(self, target / GEOTIFF)
         except OSError as error:
             raise InputError(
-                f"output folder {target}: cannot be written ({error.strerror}); name another"
+                f"output folder {target}: cannot be written ({error.strerror}); choose another folder"
             ) from None
         return names
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a north-up GeoTIFF with a band per layer and observable, and a band that is 1 without a path.
+    """Write a map as a north-up GeoTIFF: a band per layer and observable, and one that is 1 where there is no path.
 
     Args:
         coverage: The map. Without a frame, coordinates are those of the scene, and no coordinate reference system is
@@ -216,7 +216,7 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     south, north = coverage.y[0] - half, coverage.y[-1] + half
     finite = np.where(np.isfinite(values), values, np.nan)
     low, high = _range(finite)
-    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);\nvalues outside have the end colour"
+    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);\nvalues outside take the end colours"
     axes.set_facecolor(LINE)
     image = axes.imshow(
         finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,

@@ -56,7 +56,7 @@ NEAR_SHARE: Final = 0.1
 """A link counts as near measured links if they explain more than this share of the residual field's variance."""
 
 WEAKER_DB: Final = 10.0
-"""Excess over the largest calibrated path loss above which a prediction has a remark [dB]. In a synthetic town with
+"""Excess over the largest calibrated path loss above which a prediction gets a remark [dB]. In a synthetic town with
 wrong building heights, the errors of such predictions were up to 46 dB."""
 
 
@@ -124,7 +124,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
     if isinstance(links, pd.DataFrame):
         if links.columns.has_duplicates:
             name = links.columns[links.columns.duplicated()][0]
-            raise InputError(f"links: has several columns {name!r}; keep one")
+            raise InputError(f"links: several columns are named {name!r}; keep one")
         links = SourceTable(with_index_columns(links).infer_objects(), source="links")
     if not isinstance(links, SourceTable):
         raise InputError(

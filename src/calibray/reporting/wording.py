@@ -167,7 +167,7 @@ def sampling_text(record: Record) -> str:
             "load_scene.py prints no differences, because it cannot compute path loss with these antennas."
         )
     else:
-        causes.append("load_scene.py prints the difference of every link.")
+        causes.append("load_scene.py prints the difference for every link.")
     return " ".join(causes)
 
 
