@@ -128,7 +128,7 @@ def table_layout(
     intervals: Intervals,
     dtype: type,
 ) -> TableLayout:
-    """Find the position of every coefficient [J] in the tables. The degrees `root` [M] are from `spacing_roots`.
+    """Find the position of every coefficient [J] in the tables. The degrees `root` [M] come from `spacing_roots`.
 
     `steps` are the indices of the coefficients at each step of each group, of any shape; the index J marks an empty
     position, whose coefficient is 1.

@@ -6,8 +6,8 @@ are materialized (`calibray.fields.arithmetic.materialize`). Otherwise, XLA on t
 its uses and repeat it there.
 
 Large programs with tables are evaluated in stages that are compiled separately. A single stage interpolates
-coefficients, propagates the fields and computes the power, so that it reads every constant once and writes one number
-per path.
+coefficients, propagates the fields and computes the power, so it reads every constant once and writes one number per
+path.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Observables of links other than path loss, as a receiver measures them, with derivatives.
+"""Observables other than path loss, as a receiver measures them, with derivatives.
 
 Each observable is a power-weighted statistic of the paths that a receiver resolves in a link. A receiver of limited
 bandwidth resolves taps instead of paths. Taps are samples of its power delay profile, in which the pulse of each path
 is spread over a few taps. The receiver does not detect taps far below the strongest tap or below its noise floor. A
-logistic function of the level in dB, `SOFT_DB` wide, replaces each of these hard limits, so that derivatives are exact.
-The function changes the weight of taps within about 2 dB of a limit. `docs/measurements/observables.md` shows the error
-of the smooth limit.
+logistic function of the level in dB, `SOFT_DB` wide, replaces each of these hard limits, so derivatives are exact. The
+function changes the weight of taps within about 2 dB of a limit. `docs/measurements/observables.md` shows the error of
+the smooth limit.
 """
 
 from __future__ import annotations

@@ -269,7 +269,7 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Extend the parameters by the material constants that are not calibrated, on a logarithmic scale.
+    """Add the material constants that are not calibrated to the parameters, on a logarithmic scale.
 
     If the links have several carriers, constants that depend on frequency stay fixed.
     """
@@ -284,6 +284,6 @@ def with_constants(
             )
             if not adjustable or not (one_carrier or constant == "thickness"):
                 continue
-            if lower in bound and upper in bound:  # a permittivity near 1 has no room below
+            if lower in bound and upper in bound:  # the lower bound of a permittivity near 1 would be below 1
                 constants.append(Parameter(f"{name}.{constant}", lower, upper, value, "log"))
     return replace(parameters, items=(*parameters.items, *constants))

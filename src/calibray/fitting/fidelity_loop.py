@@ -29,9 +29,9 @@ def retrace(
     """Trace with the calibrated materials, and calibrate again as long as path loss changes by more than the tolerance.
 
     The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
-    them. Path loss at displaced antennas is interpolated. If a study uses none of these, the paths are not traced
-    again. Only the method `auto` calibrates again; other methods have a fixed budget of RT calls. The stage of
-    `progress` is "checking".
+    them. Path loss at displaced antennas is interpolated. Without refraction, diffuse reflection and displacements, the
+    paths are not traced again. Only the method `auto` calibrates again; other methods have a fixed budget of RT calls.
+    The stage of `progress` is "checking".
 
     Returns:
         The problem of the last calibration, its search, and the gap of every link [L], [dB]: path loss on paths traced

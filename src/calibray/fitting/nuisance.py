@@ -76,7 +76,7 @@ class Term:
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
         """The term with the same columns at other links, for prediction.
 
-        A link whose group label [n] is unknown belongs to no group. For a term without groups, no labels are given.
+        A link whose group label [n] is unknown belongs to no group. Pass no labels for a term without groups.
 
         Raises:
             InputError: The links' table lacks the column, or the labels do not match the term.

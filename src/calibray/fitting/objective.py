@@ -128,7 +128,7 @@ class Objective:
         return self._fitted(self.measured - self.capped(path_loss))
 
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The `coefficients` for the prediction of other links [n, q], from path loss [n, L], [dB].
+        """The `coefficients` for predicting other links [n, q], from path loss [n, L], [dB].
 
         A coefficient that is not `determined` is the mean of the determined ones of its term. The determined
         coefficients are then fitted again.

@@ -68,7 +68,7 @@ SEARCHES: Final = 32
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Set the weight of links with a predicted power near the noise floor to 0, and mark these links in `faint`.
+    """Give links with a predicted power near the noise floor a weight of 0, and mark them in `faint`.
 
     The problem is unchanged if there is no noise floor. It is also unchanged on an engine without derivatives, because
     its calls are expensive. If the remaining links determine fewer unknowns, the problem is unchanged and a warning is
@@ -265,7 +265,7 @@ class GroupSpread(NamedTuple):
     Attributes:
         between: Standard deviation between groups, in the unit of the residuals per unit of the column; 0 if the groups
             do not differ, and `UNKNOWN_DB` if the links do not determine it.
-        within: Standard deviation of single links within a group, in the unit of the residuals.
+        within: Standard deviation of individual links within a group, in the unit of the residuals.
     """
 
     between: float

@@ -178,7 +178,7 @@ class Problem:
         return self.evaluate_candidates(self.parameters.from_search(points), derivatives)
 
     def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """Like `evaluate`, but for candidates in physical units [n, d], without rounding errors of a conversion."""
+        """Like `evaluate`, but for candidates in physical units [n, d], which avoids rounding in the conversion."""
         with_slopes = derivatives and self.differentiable
         answer = self.respond(candidates, with_slopes)
         evaluation = self.judge(candidates, answer)

@@ -6,7 +6,7 @@ conductivity, slabs or half-spaces, and the polarization of its antennas. We fit
 calls so far (`ray_fit.py`). The power of every path is then corrected to match the last call. The next call is at the
 minimum of the replay of this corrected program, and tests this replay.
 
-The first call is at the start values. The second call is at the point where the ratios are most informative about the
+The first call is at the initial values. The second call is at the point where the ratios are most informative about the
 assumed constants. Among `PROBES` random points, this point has the largest mean log determinant of the information
 matrix.
 """

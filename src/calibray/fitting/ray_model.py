@@ -112,7 +112,7 @@ class RayModel:
 
     @cached_property
     def meets_calibrated(self) -> bool:
-        """Whether any path meets a material with a parameter; otherwise no ratio of powers differs from 1."""
+        """Whether any path interacts with a material with a parameter; otherwise no ratio of powers differs from 1."""
         met = {list(self.paths.materials)[index] for index in np.unique(self.paths.material)}
         return any(item.material in met for item in self.parameters)
 

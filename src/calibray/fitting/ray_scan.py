@@ -192,7 +192,7 @@ def _minima(
 class _Scanned(NamedTuple):
     """The P paths of a scan with at most D interactions, at the last call and at C earlier calls.
 
-    P is always `SCANNED`, so that few functions are compiled. Missing paths have weight 0.
+    P is always `SCANNED`, so few functions have to be compiled. Missing paths have weight 0.
 
     Attributes:
         exists: Whether a path has an interaction with this index [D, P].

@@ -70,7 +70,7 @@ FEW_LINKS: Final = 500
 """Number of links up to which linear algebra uses one thread."""
 
 MAX_LINKS: Final = 100_000
-"""Number of links above which no draws are made: the whitening of correlated errors would take minutes."""
+"""Number of links above which no draws are made, because whitening correlated errors would take minutes."""
 
 MAX_COLUMNS: Final = 100
 """Largest number of nuisance columns for which the draws include the coefficients."""
@@ -84,7 +84,7 @@ CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", 
 span three decades. Verdicts refer to these widths, so wider bounds do not improve a verdict."""
 
 EXACT_DB: Final = 1e-6
-"""RMSE below which the data count as free of noise, so that linear theory is exact [dB]."""
+"""RMSE below which the data are treated as free of noise, and linear theory as exact [dB]."""
 
 FEWEST_DRAWS: Final = 30
 """Smallest number of effective draws for which standard deviations are compared; their uncertainty is then 13 %."""
@@ -99,7 +99,7 @@ class Certainty:
     """Uncertainty of a calibration.
 
     Attributes:
-        record: The uncertainty as the result states it.
+        record: The uncertainty as stored in the result.
         posterior: All draws; None if no draws were made.
         calls: Number of replays made for the assessment.
         seconds: Time taken by the assessment [s].
@@ -186,7 +186,7 @@ def _approximate(intervals: dict[str, Interval]) -> dict[str, Interval]:
 def _assess(
     problem: Problem, engines: Sequence[Problem], trail: Trail, progress: Progress | None
 ) -> Certainty:
-    """Uncertainty of a problem; the draws come from `engines`, copies of the problem with equally likely engines."""
+    """Uncertainty of a problem, from draws for `engines`: copies of the problem with equally likely engines."""
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
@@ -338,10 +338,10 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
     """For each parameter of the study, the share of its interval's width that remains without each cause.
 
-    Draws without a cause, for example those with equal buildings, are draws from the posterior of a study that rules
-    this cause out. The effect of the constants that the scene fixes is removed by linear regression of the parameter on
-    these constants. The share that remains is an upper bound, because the true dependence may be nonlinear. Only causes
-    that noticeably widen an interval are listed, in ascending order of the shares.
+    Draws in which a cause is absent, for example those with equal buildings, are draws from the posterior of a study
+    that rules this cause out. The effect of the constants that the scene fixes is removed by linear regression of the
+    parameter on these constants. The share that remains is an upper bound, because the true dependence may be
+    nonlinear. Only causes that noticeably widen an interval are listed, in ascending order of the shares.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]

@@ -1,4 +1,4 @@
-"""Replay in which further constants vary: constants of single buildings, and constants that the scene fixes.
+"""Replay in which further constants vary: constants of individual buildings, and constants that the scene fixes.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each
 combination of a building and a material becomes a separate material.
@@ -43,7 +43,7 @@ floor in Auckland, 71 % of the interactions are left out, which changes the path
 (RMS); the errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
 
 EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
-"""Fields of parameters that are exponents of laws of frequency."""
+"""Fields of parameters that are exponents in frequency laws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +80,8 @@ class Split(ABC):
     Attributes:
         parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
         building_of: Index of each constant's building; -1 for other objects, such as the ground [c].
-        met: Indices of the buildings that the paths meet.
-        interactions: Number of interactions that are evaluated for a candidate.
+        met: Indices of the buildings with which the paths interact.
+        interactions: Number of interactions that are evaluated per candidate.
     """
 
     parameter_of: NDArray[np.int64]
@@ -112,7 +112,7 @@ class SplitReplay(Split):
     """A split replay in this process.
 
     Attributes:
-        parameters: The parameters; some may be coefficients of laws of frequency.
+        parameters: The parameters; some may be coefficients of frequency laws.
         parts: The replays of the carriers.
     """
 
@@ -226,10 +226,10 @@ def replayed_materials(problem: Problem) -> list[dict[str, Material]]:
 
 
 def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> Split:
-    """Extend a problem's replay by further parameters and, if `by_building`, by separate constants for each building.
+    """Add further parameters to a problem's replay and, if `by_building`, separate constants for each building.
 
     `can_split` must be true for the problem. The study's parameters come first; a further parameter is a constant that
-    is equal at all carriers. If the paths meet fewer than two buildings, no constant belongs to a building.
+    is equal at all carriers. If the paths interact with fewer than two buildings, no constant belongs to a building.
     """
     engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
     # Weak paths often arrive late, and delay spreads depend on late paths, so further observables need all paths.

@@ -4,8 +4,8 @@ Intervals require thousands of evaluations, and calls are expensive. A Gaussian 
 interpolates the calls (`multifidelity/discrepancy.py`). The mean of the process is the corrected replay of the study's
 scene if it is available and not misleading, and otherwise a constant. The uncertainty of the process must widen the
 intervals. We therefore draw functions from the process, use each function as an engine, and pool the resulting
-posteriors. Every call is also predicted from all others. If the errors of these predictions exceed the expected errors,
-the spread of the drawn functions is increased by the same factor.
+posteriors. Each call is also predicted from all the others. If the errors of these predictions exceed the expected
+errors, the spread of the drawn functions is increased by the same factor.
 """
 
 from __future__ import annotations
@@ -86,8 +86,7 @@ class ConstantMean:
 class ResponseRows:
     """The emulated rows, which replace the residuals: path loss of links with nonzero weight, then further observables.
 
-    Further observables are divided by their errors and multiplied by that of path loss, so that all rows are
-    comparable.
+    Further observables are divided by their errors and multiplied by that of path loss, so all rows are comparable.
 
     Attributes:
         problem: The problem.
@@ -138,7 +137,7 @@ class ResponseRows:
 
     @property
     def used(self) -> list[NDArray[np.int64]]:
-        """For each further observable, indices of the links that have it."""
+        """For each further observable, the indices of the links with a value."""
         return [each.used(self.problem.objective.weight) for each in self.problem.observed]
 
     def unit(self, index: int) -> float:
@@ -238,7 +237,7 @@ class EmulatedEngine:
     def _further(
         self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Iterator[tuple[Observed, NDArray[np.int64], NDArray[np.float64]]]:
-        """Each further observable, the links that have it, and its part of the emulated rows [n, m, ...]."""
+        """Each further observable, the links with a value, and its part of the emulated rows [n, m, ...]."""
         first = len(self.rows.links)
         every = self.rows.problem.observed if wanted else ()
         for each, used in zip(every, self.rows.used, strict=False):
@@ -319,7 +318,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls in which every link with nonzero weight has a path loss; at most `MAX_CALLS`, most of them the best."""
+    """The calls with a path loss for every link with nonzero weight; above `MAX_CALLS`, the best and some others."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)

@@ -2,7 +2,8 @@
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
 - Constants that the scene fixes for the calibrated materials, such as thickness, are never known exactly. They have a
-  log-normal prior around the scene's value. A scattering coefficient of 0 is exact with a probability of one half.
+  log-normal prior around the scene's value. A scattering coefficient of 0 is taken as exact with a probability of one
+  half.
 - A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
   between-building spread s is zero with probability `ALIKE`, and otherwise exponentially distributed.
 - Errors follow one of several noise models (`noise_models.py`). The noise level, the nuisances and an undeclared offset
@@ -124,10 +125,10 @@ class JointModel:
         study: The study's d parameters.
         parameters: The study's parameters, then k constants that the scene fixes.
         priors: Log-normal priors, in addition to flat priors over the unit cube.
-        gaps: Computes measured minus modelled path loss.
+        gaps: Computes the gaps, measured minus modelled path loss; see `Gaps`.
         loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
-        parameter_of: Index of the parameter to which each of the c constants of single buildings belongs [c].
+        parameter_of: Index of the parameter to which each of the c constants of individual buildings belongs [c].
         building_of: Index of the building of each of these constants [c].
         only_buildings: Indices of the parameters whose constants all belong to buildings; the buildings alone determine
             the mean.
@@ -333,7 +334,7 @@ def _with_constants(
     index = [every.names.index(name) for name in parameters.names]
 
     def full(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values, extended by the constants that have no effect."""
+        """Values, with the constants that have no effect inserted."""
         all_values = np.tile([item.start for item in every.items], (len(values), 1))
         all_values[:, index] = values
         return all_values

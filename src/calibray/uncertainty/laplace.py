@@ -4,7 +4,7 @@ There are two models of heavy tails. Either the errors follow Student's t, with 
 errors are Gaussian and a few are gross, for example because a link's position was recorded incorrectly. Gross errors
 are Gaussian with a larger standard deviation (J. W. Tukey, in: Contributions to Probability and Statistics, 1960). We
 fit both distributions by iteratively reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am.
-Stat. Assoc. 84 (1989) 881) and integrate around the mode, with the Fisher information.
+Stat. Assoc. 84 (1989) 881) and integrate around the mode, using the Fisher information.
 
 Censored links are known only to lie below the noise floor. A measured link contributes the density of its error. A
 censored link contributes the probability that its error is at least as large as the floor requires (J. Tobin,
@@ -199,7 +199,7 @@ OfSquare = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Tail(NamedTuple):
-    """A distribution of errors with unit scale; it is either the same for all gaps or different for each gap.
+    """A distribution of errors with unit scale, either the same for all gaps or different for each gap.
 
     Attributes:
         log_density: Its log density as a function of the squared errors.

@@ -20,7 +20,7 @@ GRID: Final = 20
 """Number of cells along the longer side of the area."""
 
 SAMPLES: Final = 128
-"""Number of points along each line, several in each cell that it crosses."""
+"""Number of points along each line: enough for several in each cell that the line crosses."""
 
 HEIGHTS: Final = (5.0, 10.0, 20.0)
 """Heights of the rectangles' tops above the lowest antenna [m], for hedges, street trees and tall trees."""
@@ -62,7 +62,7 @@ class MissingRegion:
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses it; an estimate if not all links are used.
         share: Share of the mean square of the residuals that it explains.
-        chance: Share of their mean square that the best rectangle explains for permuted residuals (median).
+        chance: Median share of the mean square that the best rectangle explains if the residuals are permuted.
         significant: Whether at least `FEW` links cross it, and no permutation has a rectangle that explains as much.
     """
 
@@ -122,7 +122,7 @@ def missing_region(
         # The part of the lengths that the fitted columns do not explain already.
         inside = length - basis @ (basis.T @ length)
         rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
-        # The same heights and rectangles are searched for residuals in random order.
+        # Residuals in random order are tested with the same heights and rectangles.
         chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
         top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
@@ -157,7 +157,7 @@ def _grid(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[NDArray[np.
 def _lengths(
     tx: NDArray[np.float64], rx: NDArray[np.float64], corner: NDArray[np.float64], cell: float, top: float
 ) -> NDArray[np.float64]:
-    """Length of the part of every line that is below the height `top` in every cell of the grid [n, cells], [m]."""
+    """Length of the part of each line below the height `top`, in each cell of the grid [n, cells], [m]."""
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES
     point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
     index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)
@@ -205,7 +205,7 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
 
 
 def _summed(values: NDArray[np.float64], axes: Sequence[int]) -> NDArray[np.float64]:
-    """Cumulative sums along axes, starting at 0, so that the sum over any range is a difference of two values."""
+    """Cumulative sums along axes, starting at 0; the sum over any range is then a difference of two values."""
     for axis in axes:
         values = np.insert(np.cumsum(values, axis=axis), 0, 0.0, axis=axis)
     return values

@@ -95,7 +95,7 @@ FREEDOMS: Final = (2.0, 4.0)
 DEPARTURE: Final = 2.0
 """Prior weight of an offset, relative to no offset, and of correlated or heavy-tailed errors, relative to independent
 Gaussian errors. Measured errors are rarely independent and Gaussian. Larger errors out of sight have weight one. If the
-twin lacks refraction, their posterior weight then exceeds 0.9 in five of nine development runs."""
+twin lacks refraction, their posterior weight exceeds 0.9 in five of nine development runs."""
 
 IMPROBABLE: Final = 50.0
 """With many links, a model is left out if the log odds against it at the optimum reach this value. At its own optimum,

@@ -26,7 +26,7 @@ SPREAD_GRID: Final = 64
 """Number of points of the logarithmic grid from which the spread is drawn."""
 
 ACCEPTANCE: Final = 0.25
-"""Target share of accepted moves, which determines the lengths of moves. It is near 0.234, the optimum of random walks
+"""Target share of accepted moves, which determines the lengths of moves. It is near 0.234, the optimum for random walks
 (G. O. Roberts, A. Gelman and W. R. Gilks, Annals of Applied Probability 7, 1997)."""
 
 JITTER: Final = 1e-4
@@ -208,7 +208,7 @@ class Moves:
         return population.updated(accepted, proposal), replace(lengths, buildings=buildings)
 
     def _redraw_all_buildings(self, population: Population) -> Population:
-        """Propose spread and deviations from their prior, so that buildings become equal or differ more or less."""
+        """Propose spread and deviations from their prior; buildings then become equal, or differ more or less."""
         count = len(population.spread)
         proposal = replace(
             population,

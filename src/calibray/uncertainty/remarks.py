@@ -47,8 +47,8 @@ CONFLICT_STARTS: Final = 32
 """Number of local searches per fit."""
 
 DOMINANT: Final = 1e3
-"""Factor on the residuals of the further observables in the fit to these observables alone. In the fit to path loss
-alone, these residuals are divided by this factor. All fits can then use the same compiled program."""
+"""Factor by which the residuals of the further observables are multiplied in the fit to these observables alone. In the
+fit to path loss alone, these residuals are divided by this factor. All fits can then use the same compiled program."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
@@ -213,7 +213,7 @@ def _lacking(study: StudyModel) -> list[str]:
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
-    """A remark if a draw has a lower objective [dB] than the method's best candidate, by at least `MISSED_DB`."""
+    """A remark if a draw's objective [dB] is lower than that of the method's best candidate by at least `MISSED_DB`."""
     top = posterior.point[np.argsort(-posterior.density)[:16]]
     lowest = float(problem.squares(top).value.min())
     if lowest > best_value - MISSED_DB:

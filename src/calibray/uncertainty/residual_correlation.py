@@ -203,7 +203,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances [m, m] between positions [n, k] of links; of a subset if there are at least twice `EXACT` links."""
+    """Distances [m, m] between positions [n, k] of links, or of a subset if there are at least twice `EXACT` links."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 

@@ -33,9 +33,9 @@ EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: the number of steps times the number of moves per step."""
 
 POPULATIONS: Final = (2, 4, 8)
-"""Numbers of independent populations; the number is increased as long as the two halves disagree. If several
-interference fringes of slabs fit, the mean of a population of 256 members scatters by 0.2 posterior standard
-deviations. In three development districts, the draws of two or four populations agree for half of the true scenes."""
+"""Numbers of independent populations; the number is increased as long as the two halves disagree. If several slab
+resonances fit, the mean of a population of 256 members scatters by 0.2 posterior standard deviations. In three
+development districts, the draws of two or four populations agree for half of the true scenes."""
 
 SWEEPS: Final = 4
 """Number of sweeps per step; a sweep applies each kind of move to every member. The share of one of two distant ranges
@@ -43,10 +43,10 @@ in five dimensions then scatters by 0.03 between seeds. With 2 sweeps, it scatte
 
 LAST_SWEEPS: Final = (8, 48)
 """Smallest and largest number of further sweeps at power 1. A population that is smaller because of the budget gets
-more sweeps, so it provides as many draws. On a small program, the number of sweeps is as large as the budget allows. In
-districts of 300 to 800 interactions, distribution functions after 8, 24 and 48 sweeps differ by 0.053, 0.043 and 0.036
-from those of a million draws from the prior (`benchmarks/simulation_based.py --reference`). With 8 sweeps of 104
-members, widths of intervals differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 %
+more sweeps, so it provides as many draws as a larger one. On a small program, the number of sweeps is as large as the
+budget allows. In districts of 300 to 800 interactions, distribution functions after 8, 24 and 48 sweeps differ by
+0.053, 0.043 and 0.036 from those of a million draws from the prior (`benchmarks/simulation_based.py --reference`). With
+8 sweeps of 104 members, widths of intervals differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 %
 (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 KEPT: Final = 2
@@ -63,7 +63,7 @@ APART: Final = 0.2
 256 independent draws differ by up to 0.12 in 19 of 20 cases; members of one population are not quite independent."""
 
 APART_BY_CHANCE: Final = 2.0
-"""Factor of the same limit for small populations. The limit is this factor times sqrt(2 / n) for halves of n members
+"""Factor that sets this limit for small populations: the limit is the factor times sqrt(2 / n) for halves of n members
 each. A factor of 1.36 would be the 95 % point of independent draws (Kolmogorov and Smirnov)."""
 
 
@@ -73,7 +73,7 @@ class Posterior:
 
     Attributes:
         means: Draws of the study's parameters, in its search space; each is the mean over all buildings.
-        seen: The same draws for the buildings that the links meet: the geometric means of their constants.
+        seen: The same draws for the buildings with which the paths interact: the geometric means of their constants.
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
@@ -288,7 +288,7 @@ def _anneal(
 
 
 def _next_power(log_likelihood: NDArray[np.float64], power: float) -> float:
-    """The largest power with which the share `EFFECTIVE` of the members stays effective, by bisection."""
+    """The largest power for which the share `EFFECTIVE` of the members stays effective, by bisection."""
 
     def effective_share(other: float) -> float:
         weight = _weights((other - power) * log_likelihood)

@@ -101,14 +101,15 @@ def linear_intervals(
 
 
 JUDGED: Final = 0.9
-"""Level of the credible sets on which the verdicts are based. The last few per cent of a 95 % interval can lie far
-away, because of a noise model of small weight."""
+"""Level of the credible sets on which the verdicts are based. The last few per cent of a 95 % interval can lie far from
+the rest, because of a noise model with a small weight."""
 
 IDENTIFIED: Final = 0.25
 """Largest width of the credible set of an identified parameter, as a share of the range."""
 
 WEAKLY: Final = 0.5
-"""Largest such share for a weakly identified parameter; with a wider set, a parameter is not identifiable."""
+"""Largest width of the set of a weakly identified parameter, as a share of the range; above it, a parameter is not
+identifiable."""
 
 NO_EFFECT_DB: Final = 1.0
 """Change of path loss over a parameter's range below which no link counts as dependent on the parameter [dB]."""
@@ -174,7 +175,7 @@ class Axes:
         upper: Upper bounds [d].
         value: Maps the index of a parameter and a search coordinate to the value that is stated in reasons.
         customary: Usual widths of the parameters' ranges [d]; widths of the bounds if None. Shares refer to the smaller
-            width, so that wider bounds do not improve a verdict.
+            width, so wider bounds do not improve a verdict.
     """
 
     names: Sequence[str]
