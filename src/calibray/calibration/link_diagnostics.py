@@ -162,7 +162,7 @@ def _depth_and_power(paths: Paths, materials: dict[str, Material]) -> _Power:
     depth[paths.link[order]] = count[order]
     total = np.bincount(paths.link, power, paths.num_links)
     part = power / np.where(total > 0, total, np.inf)[paths.link]
-    # One code per pair of material and kind; a path counts once for each pair that it meets.
+    # One code per pair of material and kind; a path counts once for each pair on it.
     kinds = max(Kind) + 1
     path_of = np.repeat(np.arange(paths.num_paths), count)
     path_index, codes = np.unique(

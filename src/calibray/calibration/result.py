@@ -187,9 +187,9 @@ class Result(Record):
     def apply(self, scene: object) -> None:
         """Set the materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
-        These are `scene_materials`, as in exports: those of the prediction model if blocks were held out, otherwise the
-        calibrated ones. If the scene has a different carrier, a warning states both carriers. Unlike the constants of
-        ITU materials, these constants do not change when `scene.frequency` is set.
+        These are `scene_materials`, as in exports: those of the prediction model, or the calibrated ones if it uses no
+        scene. If the scene has a different carrier, a warning states both carriers. Unlike the constants of ITU
+        materials, these constants do not change when `scene.frequency` is set.
 
         Raises:
             InputError: The object is not a Sionna RT scene, or the scene lacks a material.

@@ -33,7 +33,8 @@ BATCH: Final = 10_000
 """Largest number of links that are traced and evaluated together."""
 
 DIFFUSE_BATCH: Final = 50
-"""The same limit with diffuse reflection, which produces tens of thousands of paths per link."""
+"""Largest number of links that are traced together with diffuse reflection, which finds tens of thousands of paths per
+link."""
 
 CHUNKS_PER_BATCH: Final = 100
 """Number of chunks that are sent to the workers together."""

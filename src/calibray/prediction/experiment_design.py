@@ -58,10 +58,10 @@ class Errors:
     """Expected errors of the candidates' measurements, for given parameters.
 
     Attributes:
-        own_db: Standard deviation of each candidate's uncorrelated part [dB].
+        own_db: Standard deviation of the uncorrelated part of each candidate's error [dB].
         common: Effect of one standard deviation of each common unknown [candidates, unknowns], [dB].
         position: Positions of the receivers, or of both ends [candidates, k], [m].
-        shared_db: Standard deviation of the part that neighbouring candidates share [dB]; 0 for none.
+        shared_db: Standard deviation of the part of the error that neighbouring candidates share [dB]; 0 for none.
         range_m: Distance at which the correlation of this part has fallen to 1/e [m].
     """
 

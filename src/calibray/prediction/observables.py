@@ -57,8 +57,8 @@ def further_observables(
 ) -> dict[str, NDArray[np.float64]]:
     """Further observables at the links of an opened study [links], without device biases, by column name.
 
-    The interval has two parts: the errors of single values, from held-out links if there are any, and the scatter of
-    the draws. The result is empty if the study has no further observables, or if the prediction model uses no scene.
+    The interval has two parts: the errors of individual values, from held-out links if there are any, and the scatter
+    of the draws. The result is empty if the study has no further observables, or if the prediction model uses no scene.
     """
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):

@@ -85,7 +85,7 @@ def suggest(
         candidates: Possible measurements: links, or a table, as for `Result.predict`.
         count: Largest number of suggestions; a warning is logged if there are fewer.
         progress: Called with the name of each stage, the completed work and the total.
-        allow_changed_inputs: Continue even if a file of the scene or an antenna, or the links have changed since the
+        allow_changed_inputs: Continue even if the links, or a file of the scene or an antenna, have changed since the
             calibration.
         observables: Also report which further observable is worth measuring at each suggestion.
 
@@ -94,9 +94,9 @@ def suggest(
         The columns path_loss_db and spread_db are the mean and the standard deviation of the draws' predictions [dB].
         For every parameter, NAME_width is the expected width of its 95 % interval once this candidate and those above
         are measured. For a parameter with several ranges, NAME_sure is the expected probability that the right range is
-        known. The column gain is a summary as text. With `observables`, the column observable names the quantity that
-        narrows the intervals most if it is measured in addition to path loss at this candidate and those above. The
-        column observable_gain is a summary as text.
+        known. The column gain summarizes these gains in words. With `observables`, the column observable names the
+        quantity that narrows the intervals most if it is measured in addition to path loss at this candidate and those
+        above. The column observable_gain summarizes its gain in words.
 
     Raises:
         InputError: `Result.predict` would refuse the input for a reason other than unknown groups; the calibration has

@@ -37,13 +37,13 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
         and standard deviation of the residuals [dB] on the calibration links. Residuals are predicted minus measured
-        values of the measured quantity. "obstruction" and "streets": the same, by the length of the straight line below
-        roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would explain
-        the largest part of the residuals. "leverage": leverage and residual of every calibration link. "power": share
-        of the links' power by material and type of interaction. "trade_offs": correlation of the draws of each pair of
-        unknowns. "neighbours": semivariance of the residuals by distance between links, computed from the positions of
-        both ends. "moved": value of every parameter before and after calibration, with the change and the width of the
-        95 % interval as shares of its range.
+        values of the measured quantity. "obstruction" and "streets": the same values, by the length of the straight
+        line below roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would
+        explain the largest part of the residuals. "leverage": leverage and residual of every calibration link. "power":
+        share of the links' power by material and type of interaction. "trade_offs": correlation of the draws of each
+        pair of unknowns. "neighbours": semivariance of the residuals by distance between links, computed from the
+        positions of both ends. "moved": value of every parameter before and after calibration, with the change and the
+        width of the 95 % interval as shares of its range.
     """
     tables = {
         "distance": _by_distance(result),

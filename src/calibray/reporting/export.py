@@ -35,7 +35,7 @@ VERIFIED_LINKS: Final = 3
 """Number of links for which the path loss of the exported scene is verified."""
 
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
-"""Settings that have a different name in Sionna RT's path solver."""
+"""Settings that have different names in Sionna RT's path solver."""
 
 MATLAB: Final = """function T = materials
 %MATERIALS Calibrated materials as a table, or as a structure in Octave.

@@ -55,7 +55,7 @@ class Plan:
         west: Coordinate of the left edge [m].
         north: Coordinate of the upper edge [m].
         scale: Map units per metre [1/m].
-        buildings: Outlines of buildings, as data of an SVG path.
+        buildings: Outlines of buildings, as SVG path data.
         walls: Vertical faces seen from above, in the same form.
         bar: Length of the scale bar [m].
         regions: Outlines of the study's regions, in the same form.

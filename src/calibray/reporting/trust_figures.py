@@ -153,7 +153,7 @@ def _rmse(error: NDArray[np.float64]) -> float:
 
 @style.styled()
 def power(table: pd.DataFrame) -> Figure:
-    """Draw power by material and type of interaction."""
+    """Draw the share of power by material and type of interaction."""
     shown = table.head(ROWS)
     names = [f"{row.material} {row.interaction}".strip() for row in shown.itertuples()]
     figure, axes = style.plain_figure("Mean share of a link's power [%]", "", height=1.2 + 0.3 * len(shown))

@@ -165,7 +165,7 @@ def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
-    """The model with the lowest RMSE among the given names, of those that have residuals [n], [dB]."""
+    """The model with the lowest RMSE among those named that have residuals [n], [dB]."""
     return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
 
 

@@ -191,7 +191,7 @@ def kriged(
 ) -> dict[Model, NDArray[np.float64]]:
     """The result of `kriging` under a name; empty if kriging is impossible.
 
-    It is impossible if there are too few or too many links, if all have one position, or if all residuals are zero.
+    Kriging is impossible with too few or too many links, if all have one position, or if all residuals are zero.
     """
     try:
         return {name: kriging(links, objective, trend_db)}

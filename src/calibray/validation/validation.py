@@ -62,7 +62,7 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
 class Validation(HeldOutErrors):
     """Held-out errors of several models on the same links, and the conclusions from these errors.
 
-    The error expected in a block is estimated from the other blocks, so that no block contributes to its own estimate.
+    The error expected in a block is estimated from the other blocks, so no block contributes to its own estimate.
     """
 
     @classmethod
