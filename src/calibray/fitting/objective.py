@@ -178,8 +178,8 @@ class Objective:
     def determined(self) -> NDArray[np.bool_]:
         """Mask of the columns that the links with nonzero weight determine [q].
 
-        Examples of undetermined coefficients are the offset of a group without such links, or the slope of a group in
-        which all links have the same distance.
+        Examples of undetermined coefficients are the offset of a group whose links all have weight 0, or the slope of a
+        group whose links all have the same distance.
         """
         if not self.nuisance.terms:
             return np.zeros(0, dtype=bool)

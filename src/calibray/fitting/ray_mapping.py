@@ -92,7 +92,7 @@ class RayMap:
             [dB].
         changed: Largest number of paths that occur in the best call but not in another call, or vice versa.
         changed_db: Largest change of a link's path loss if these paths are left out, over links that keep a path [dB].
-        lost: Number of links that keep no path, or that have no path in the replay at the best call.
+        lost: Number of links that lose all their paths, or that have no path in the replay at the best call.
         half_spaces: Materials whose thickness the calls do not determine.
         minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
         remaining_db: Objective on this replay at the best call minus that at the lowest of these minima [dB].

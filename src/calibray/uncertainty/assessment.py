@@ -55,8 +55,8 @@ NEGLIGIBLE_DB: Final = 0.05
 
 DRAWS_PER_CALL: Final = 40
 """Number of evaluations, per call of the calibration, that larger populations may use if small populations disagree. A
-call with derivatives takes as long as 10 to 16 of these evaluations. In 24 runs in districts 100 to 106, populations of
-64 members disagreed in 8. With 256 members instead, the share of the posterior that the worst 90 % set contains rose
+call with derivatives takes as long as 10 to 16 of these evaluations. Populations of 64 members disagreed in 8 of 24
+runs in districts 100 to 106. With 256 members instead, the share of the posterior that the worst 90 % set contains rose
 from 0.76 to 0.80, on average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
 
 EQUAL: Final = 0.1

@@ -386,7 +386,7 @@ def has_offset(problem: Problem) -> bool:
 
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
-    """Constants that the scene fixes and that are equal at all carriers, of materials with a parameter.
+    """Constants of materials with a parameter: those that the scene fixes and that are equal at all carriers.
 
     A scattering coefficient of 0 that the study states is exact for the material and its facades.
     """

@@ -34,7 +34,7 @@ JITTER: Final = 1e-4
 reached."""
 
 NEIGHBOURHOOD: Final = 32
-"""The width of a kernel spans the share 1 / `NEIGHBOURHOOD` of the population on each side of its centre."""
+"""Each side of a kernel, one width long, spans the share 1 / `NEIGHBOURHOOD` of the population on average."""
 
 TINY: Final = 1e-30
 """Value that replaces a constant of 0 in logarithms; factors on such a constant have no effect."""

@@ -173,7 +173,7 @@ def variogram(
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
-    if len(distance):  # pairs farther apart than half the extent are few, and all join opposite ends
+    if len(distance):  # few pairs are farther apart than half the extent, and all of these join opposite ends
         near = distance <= max(np.median(distance), distance.max() / 2)
         distance, half = distance[near], half[near]
     order = np.argsort(distance, kind="stable")
