@@ -176,7 +176,7 @@ class SourceTable:
             first = int(np.flatnonzero(missing)[0])
             raise InputError(
                 f"{self.cell(first, names)}: the label is missing ({missing.sum()} missing labels in total); add the "
-                "label"
+                "label, or rename labels that count as missing, such as NA, None and null"
             )
         if pd.api.types.is_float_dtype(column):
             # A label must not depend on other rows, but pandas stores 26 as 26.0 if another row is empty or has 0.9.
