@@ -110,7 +110,7 @@ class StudyContent(Section, ABC):
         ):
             raise InputError(
                 "engine.rays contains paths for one position and one antenna at each end: remove links.tx_antenna, "
-                "rx_antenna and position_error_m"
+                "links.rx_antenna and links.position_error_m"
             )
         if self.links.mountings and self.engine.name != "replay":
             end = next(iter(self.links.mountings))

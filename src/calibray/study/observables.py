@@ -127,7 +127,7 @@ class ObservableSection(Section):
             return
         if len(edges) != bins + 1 or bins < 1 or not (np.diff(edges) > 0).all():
             raise InputError(
-                f"edges: {max(bins, 1)} bin(s) need {max(bins, 1) + 1} increasing edges, not {edges.tolist()}"
+                f"edges: {edges.tolist()}, must be {max(bins, 1) + 1} increasing numbers, one more than the bins"
             )
         if self.kind in SECTORS and edges[-1] - edges[0] > 360:
             raise InputError(f"edges_deg: span {edges[-1] - edges[0]:g} degrees, must span at most 360")

@@ -263,9 +263,10 @@ class HeightModel:
         wrong = (heights < lowest) | (heights > HEIGHTS[1])
         if np.ma.filled(wrong, False).any():
             value = stored[np.ma.filled(wrong, False)][0]
+            below = f"below {lowest:g} m or " if np.isfinite(lowest) else ""
             raise InputError(
-                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values below "
-                f"{HEIGHTS[0]:g} m or above {HEIGHTS[1]:g} m, which are not heights on land, such as {value:g}; "
+                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values {below}above "
+                f"{HEIGHTS[1]:g} m, which are not heights on land, such as {value:g}; "
                 f"declare this value as nodata (gdal_edit.py -a_nodata {value:g}), or correct the unit"
             )
         return heights

@@ -21,7 +21,7 @@ MAX_POINTS: Final = 4_000_000
 """Largest number of points in a ground sheet; it limits memory use."""
 
 STEP: Final = 200.0
-"""Difference in height from all neighbouring cells above which a cell is suspicious [m]. The number -999 in feet, which
+"""Difference in height from all neighbouring cells from which a cell is suspicious [m]. The number -999 in feet, which
 marks gaps in some models, is a height of -304 m. Buildings and masts in surface models are rarely taller than this."""
 
 _LOG: Final = logging.getLogger(__name__)
