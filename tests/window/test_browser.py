@@ -94,7 +94,9 @@ def test_the_links_are_on_the_map_with_their_reasons_beside(walked):
 
 
 def test_the_scene_is_shown_in_three_dimensions_by_its_materials(walked):
-    folder, page, _, address = walked
+    folder, _, browser, address = walked
+    # A page of its own: NiceGUI draws a scene again and again, also after its dialog was closed.
+    page = opened(browser, address)
     page.get_by_role("button", name="Show in 3-D").click()
     dialog = page.get_by_role("dialog")
     materials = ["brick_wall", "plasterboard_wall", "floor", "ceiling"]
@@ -116,6 +118,8 @@ def test_the_scene_is_shown_in_three_dimensions_by_its_materials(walked):
     assert not Axe().run(page, options=rules).response["violations"]
     page.keyboard.press("Escape")
     dialog.wait_for(state="hidden")
+    assert page.noted == []
+    page.context.close()
 
 
 def test_nothing_is_asked_of_other_machines_and_hostile_names_are_text(walked):
