@@ -80,9 +80,10 @@ def _no_lines_of_progress():
 
 FEW_CANDIDATES = {
     "fields", "prediction", "study", "tracing",
-    "test_carriers", "test_chunks", "test_dask", "test_local_workers", "test_notebooks", "test_observable",
-    "test_observed_links", "test_pose", "test_program_with_rays", "test_random_effects", "test_ray_mapping",
-    "test_rays", "test_repeats", "test_richer_paths", "test_shared_out", "test_unreached_links", "test_walk",
+    "test_carriers", "test_chunks", "test_dask", "test_engines", "test_local_workers", "test_notebooks",
+    "test_observable", "test_observed_links", "test_pose", "test_program_with_rays", "test_random_effects",
+    "test_ray_mapping", "test_ray_readers", "test_rays", "test_repeats", "test_richer_paths", "test_shared_out",
+    "test_unreached_links", "test_walk",
 }  # fmt: skip
 """Rooms and files whose tests evaluate few candidates, so that compiling takes most of their time."""
 
