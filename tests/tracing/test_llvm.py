@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -233,13 +234,16 @@ def test_this_machine_can_trace():
     assert run.stdout.split()[1] == "5.0"
 
 
-def test_the_module_tells_the_choice_or_the_remedy(tmp_path):
+def test_the_module_tells_the_choice_or_the_remedy(tmp_path, monkeypatch, capsys):
     command = [sys.executable, "-m", "calibray.tracing.llvm"]
     good = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (good.returncode, good.stderr) == (0, "")
     assert "_ad_mono_polarized: " in good.stdout
     nowhere = str(tmp_path / "none.so")
-    environment = os.environ | {llvm.PATH_VARIABLE: nowhere, "CUDA_VISIBLE_DEVICES": ""}
-    bad = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert (bad.returncode, bad.stdout) == (2, "")
-    assert bad.stderr.startswith(f"Error: DRJIT_LIBLLVM_PATH={nowhere}: ")
+    monkeypatch.setenv(llvm.PATH_VARIABLE, nowhere)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    with pytest.raises(SystemExit) as bad:
+        runpy.run_path(llvm.__file__, run_name="__main__")
+    printed = capsys.readouterr()
+    assert (bad.value.code, printed.out) == (2, "")
+    assert printed.err.startswith(f"Error: DRJIT_LIBLLVM_PATH={nowhere}: ")
