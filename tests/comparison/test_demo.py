@@ -26,7 +26,7 @@ space_mapping = module._space_mapping
 def mapping_with_few_rays(setup, *arguments):
     """Space mapping whose ray tracer sends a tenth of the rays."""
     content = setup.study.content()
-    content["trace"]["samples"] = 50_000
+    content["trace"]["samples"] = 10_000
     return space_mapping(Setup.open(Study.from_content(content, setup.study.path)), *arguments)
 
 
