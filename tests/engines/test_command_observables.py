@@ -46,7 +46,7 @@ def study(folder, after=ANSWER, **sections):
     table.to_csv(folder / "links.csv", index=False)
     content |= {
         "observables": {"spread": SECTION},
-        "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0, "std_db": 1.0},
+        "noise": {"kind": "gaussian", "range_m": 0, "std_db": 1.0},
     }
     return Study.from_content(content | sections, folder / "study.toml")
 
