@@ -142,6 +142,17 @@ def test_objects_with_similar_names_are_different_objects(measured: np.ndarray, 
     assert {"object-_", "object-_-2"} <= {*names}
 
 
+def test_a_study_does_not_depend_on_the_order_in_which_objects_were_loaded(
+    measured: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, objects = street(), rt.Scene.objects.fget
+    first = cb.Study.from_sionna(scene, measured, tmp_path / "first")
+    monkeypatch.setattr(rt.Scene, "objects", property(lambda live: dict(reversed(objects(live).items()))))
+    second = cb.Study.from_sionna(scene, measured, tmp_path / "second")
+    assert list(first.parameters) == list(second.parameters)
+    assert first.path.with_name("scene.xml").read_text() == second.path.with_name("scene.xml").read_text()
+
+
 def test_wet_ground_starts_within_its_default_bounds(measured: np.ndarray, tmp_path: Path) -> None:
     scene = street()
     scene.radio_materials["concrete"].relative_permittivity = 18.2

@@ -82,7 +82,9 @@ class LiveScene:
                 "the scene lacks a transmitter, a receiver or an antenna array; add what is missing, and set "
                 "scene.tx_array and scene.rx_array"
             )
-        parts = [part for item in live.objects.values() for part in _objects(item)]
+        # Mitsuba loads objects in parallel, so their order in the scene varies between processes.
+        items = [item for _, item in sorted(live.objects.items())]
+        parts = [part for item in items for part in _objects(item)]
         # Names become file names.
         names = unique_names(part.name for part in parts)
         objects = tuple(replace(part, name=name) for part, name in zip(parts, names, strict=True))
@@ -90,7 +92,7 @@ class LiveScene:
         return cls(
             _number(live.frequency),
             objects,
-            {item.radio_material.name: _material(item.radio_material) for item in live.objects.values()},
+            {item.radio_material.name: _material(item.radio_material) for item in items},
             (_antenna("tx", live.tx_array, live.transmitters), _antenna("rx", live.rx_array, live.receivers)),
             {name: _vector(device.position) for name, device in live.transmitters.items()},
             {name: _vector(device.position) for name, device in live.receivers.items()},
