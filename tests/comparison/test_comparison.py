@@ -2,12 +2,15 @@
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from multiprocessing import current_process
 
 import numpy as np
 import pandas as pd
+import psutil
 import pytest
 from typer.testing import CliRunner
 
@@ -209,6 +212,30 @@ def test_a_comparison_without_any_result_ends_with_its_cause(kind, workers, mess
             out=tmp_path,
             workers=workers,
         )
+
+
+WORKER = """
+import os, sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+from calibray.comparison import comparison
+
+if __name__ == "__main__":
+    with ProcessPoolExecutor(1, get_context("spawn"), comparison._start, (int,)) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_workers_end_with_a_killed_comparison(tmp_path):
+    (tmp_path / "program.py").write_text(WORKER)
+    command = [sys.executable, str(tmp_path / "program.py")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        worker = psutil.Process(int(process.stdout.readline()))
+        process.kill()
+        worker.wait(60)
+    assert not worker.is_running()
 
 
 @pytest.mark.parametrize(

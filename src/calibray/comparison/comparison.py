@@ -7,10 +7,13 @@ with many starts, or from another search that reached a lower value.
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Final
 
@@ -410,9 +413,17 @@ def _finished(
 
 
 def _start(open_problem: OpenProblem) -> None:
-    """Open the problem in a worker process, once for all runs of the process."""
+    """Open the problem in a worker process, once for all runs of the process, which ends with its parent process."""
     global _opened
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     _opened = open_problem()
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
 
 
 def _work(method: BudgetedMethod, seed: int) -> MethodRun:
