@@ -157,6 +157,12 @@ def test_nothing_is_traced_without_a_cheap_model(tmp_path, monkeypatch, method):
     assert make_cheap_replay(asked).remark is None
 
 
+def test_the_engine_decides_whether_a_cheap_model_is_needed(tmp_path):
+    asked = problem(tmp_path, engine={"name": "replay"})
+    assert make_cheap_replay(asked).model is not None
+    assert make_cheap_replay(replace(asked, engine=planted.engine())).model is None
+
+
 def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
     """The program differs from the scene, so the candidates depend on its answers; a restart repeats them."""
     content = programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 3}}}

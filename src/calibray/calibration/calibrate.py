@@ -71,7 +71,7 @@ def calibrate(
         method: Method to use instead of the study's: "auto", "sgwo-im", "gwo", ...
         seed: Seed to use instead of the study's.
         out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is also written
-            there, so that a restarted run does not repeat completed calls.
+            there, so that a restarted run does not repeat completed calls; calls of a given `engine` are not stored.
         engine: Engine for all links of the study; if None, the engine that the study specifies. Predictions use the
             study's engine.
         workers: Workers from `engines.open_workers`. They run the calls of a batch with the engine "command", or the

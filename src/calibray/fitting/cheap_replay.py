@@ -246,7 +246,8 @@ def make_cheap_replay(
     setup = problem.setup
     section = setup.study.method
     wanted = section.name in (AUTO, "space-mapping") and section.model == "replay"
-    if not wanted or not setup.study.engine.expensive or problem.observable is not PATH_LOSS:
+    exact = problem.differentiable and not setup.study.engine.expensive
+    if not wanted or exact or problem.observable is not PATH_LOSS:
         return CheapReplay()
     try:
         scene = setup if scene is None else scene
