@@ -120,9 +120,9 @@ def _same_kernels(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _few_starts() -> Iterator[None]:
-    """A sixteenth of the starting points of a search; small problems have few minima."""
+    """An eighth of the starting points of a search; small problems have few minima."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "STARTS", (16, 32))
+        patch.setattr(search, "STARTS", (16, 64))
         yield
 
 

@@ -159,7 +159,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
         (SPREAD | {"std": 0.0}, "std"),
         (SPREAD | {"file": "multipath.csv"}, "give exactly one of column"),
         (SPREAD | {"edges": [0.0, 1e-7]}, "does not use this key"),
-        (PROFILE | {"edges": [0.0, 1e-7]}, "2 bin"),
+        (PROFILE | {"edges": [0.0, 1e-7]}, "must be 3 increasing"),
         (PROFILE | {"edges": [0.0, 2e-7, 1e-7]}, "increasing"),
         (PROFILE | {"kind": "azimuth_power_arrival"}, "does not use this key"),
         (

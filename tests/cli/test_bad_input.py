@@ -48,7 +48,7 @@ CASES = {
     "negative depth": (
         "study.toml",
         ("max_depth = 1", "max_depth = -1"),
-        ["trace.max_depth", "-1", "at least 0"],
+        ["trace.max_depth", "-1", "from 0 to 100"],
     ),
     "no links file": ("study.toml", ("links.csv", "absent.csv"), ["absent.csv", "no such file"]),
     "missing column": ("study.toml", ('"loss"', '"los"'), ["links.csv", "'los'", "did you mean 'loss'?"]),
