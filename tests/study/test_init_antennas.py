@@ -156,6 +156,18 @@ def test_files_are_matched_by_name_and_hold_the_electrical_tilt(scene, tmp_path,
     assert alone.study.antennas.tx.pattern == "msi/K80010677_03T.MSI"
 
 
+def test_the_electrical_tilt_of_the_table_is_used_if_no_file_contains_one(scene, tmp_path, files):
+    for file in files.iterdir():
+        file.write_text(sector_file(0, file.stem))
+    found = drafted(scene, tmp_path, SECTORS, antennas=files)
+    assert found.study.links.tx_antenna.electrical_downtilt_deg == "ETilt"
+    reasons = {each.what: each.reason for each in found.assumptions}
+    assert "main lobes in the files are horizontal" in reasons["links.tx_antenna.electrical_downtilt_deg"]
+    (files / "K80010677_06T.MSI").write_text(sector_file(6, "K80010677_06T"))
+    mixed = drafted(scene, tmp_path, SECTORS, antennas=files)
+    assert mixed.study.links.tx_antenna.electrical_downtilt_deg == 0.0
+
+
 def test_a_missing_file_or_angle_is_named(scene, tmp_path, files):
     (files / "K80010677_06T.MSI").unlink()
     with pytest.raises(

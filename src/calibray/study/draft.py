@@ -36,7 +36,7 @@ from calibray.study.toml_file import study_text
 from calibray.support.messages import shortened
 from calibray.support.output_files import exists
 from calibray.tables import rows_text
-from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table
+from calibray.tracing.gain_table import TWO_CUT_SUFFIXES, read_gain_table, read_two_cuts
 from calibray.tracing.settings import PATTERNS, Antenna
 
 _LOG: Final = logging.getLogger(__name__)
@@ -435,12 +435,16 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     frame, of_transmitters = links.transmitter_rows, links.given.transmitters is not None
     mount: dict[str, str] = {}
     antennas: dict[str, Any] = {"tx": dict(UNKNOWN), "rx": dict(UNKNOWN)}
-    omnidirectional = np.zeros(len(frame), dtype=bool)
+    omnidirectional, tilted = np.zeros(len(frame), dtype=bool), False
     if folder is not None:
-        patterns, omnidirectional = _patterns(links, folder, mount)
+        patterns, omnidirectional, files = _patterns(links, folder, mount)
         antennas |= patterns
+        tilted = any(
+            abs(read_two_cuts(file).downtilt_deg) >= 1.0 for file in files
+        )  # cuts have whole degrees
     for key, column in transmitter_columns.find_angles(frame, of_transmitters).items():
-        if folder is not None and key.startswith("electrical") and not matches(column, "additional"):
+        electrical = folder is not None and key.startswith("electrical")
+        if electrical and tilted and not matches(column, "additional"):
             cause = "it is included in the vertical cuts of the files"
         else:
             lacking = transmitter_columns.lacks_angle(frame[column], may_be_empty=omnidirectional)
@@ -455,7 +459,9 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
             continue
         mount[key] = column
         low, high = frame[column].min(), frame[column].max()
-        links.assume(f"links.tx_antenna.{key}", column, f"by its name, {low:g} to {high:g} degrees")
+        reason = f"by its name, {low:g} to {high:g} degrees"
+        reason += "; the main lobes in the files are horizontal" if electrical and not tilted else ""
+        links.assume(f"links.tx_antenna.{key}", column, reason)
     if "azimuth_deg" not in mount and folder is not None and not omnidirectional.all():
         _LOG.warning(
             "%s: no azimuths, so directional antennas point east; add a column 'azimuth' [deg], clockwise from north",
@@ -489,8 +495,8 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
 
 def _patterns(
     links: LinksDraft, folder: Path, mount: dict[str, str]
-) -> tuple[dict[str, Any], NDArray[np.bool_]]:
-    """The antennas named in a column of the transmitters, and whether the antenna of each row is omnidirectional.
+) -> tuple[dict[str, Any], NDArray[np.bool_], list[Path]]:
+    """The antennas named in a column of the transmitters, which rows have an omnidirectional one, and their files.
 
     A name is that of a file in the folder or of a pattern of Sionna RT. A single file is used for all transmitters.
 
@@ -510,7 +516,7 @@ def _patterns(
     column = transmitter_columns.find_antenna_names(rows, by_name)
     if column is None and len(files) == 1:
         section = {"tx": _antenna(links, files[0])}
-        return section, np.full(len(rows), is_omnidirectional(Antenna(str(files[0]))))
+        return section, np.full(len(rows), is_omnidirectional(Antenna(str(files[0])))), files
     if column is None:
         raise InputError(
             f"--antennas {folder}: no column of {links.given.transmitters or links.links} contains the names of the "
@@ -534,7 +540,8 @@ def _patterns(
     links.assume("links.tx_antenna.type", column, reason)
     types = {label: _antenna(links, name) for label, name in named.items()}
     omnidirectional = {label: is_omnidirectional(Antenna(str(name))) for label, name in named.items()}
-    return {"types": types}, rows[column].astype(str).map(omnidirectional).to_numpy(bool)
+    used = [name for name in named.values() if isinstance(name, Path)]
+    return {"types": types}, rows[column].astype(str).map(omnidirectional).to_numpy(bool), used
 
 
 def _cells(links: LinksDraft, column: str, rows: NDArray[np.bool_]) -> str:

@@ -256,10 +256,10 @@ def _positions(study: StudyModel, overhead: SceneSurfaces, links: Measurements) 
             "check the origin of the positions",
         )
     elif beyond.any():
-        row = links.row[int(np.argmax(overhead.outside(links.rx)))]
+        rows = links.row[overhead.outside(links.rx)]
         yield (
             f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where there is no ground and no "
-            f"building; the first is in row {row}",
+            f"building; {len(rows):,} links end there, the first in row {rows[0]}",
             "leave out wrong positions with links.where, or create a larger scene",
         )
     if through_walls:

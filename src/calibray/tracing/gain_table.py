@@ -48,6 +48,13 @@ class TwoCuts:
     horizontal_db: NDArray[np.float64]
     vertical_db: NDArray[np.float64]
 
+    @property
+    def downtilt_deg(self) -> float:
+        """Angle of the main lobe below the horizon [deg]: the mean angle in front with the least attenuation."""
+        angle = (np.arange(360) + 180) % 360 - 180
+        front = np.abs(angle) < 90
+        return float(angle[front & (self.vertical_db == self.vertical_db[front].min())].mean())
+
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
         """Gain in any direction of the antenna's frame [...], [dBi]; azimuths are counter-clockwise from the x axis.
 
