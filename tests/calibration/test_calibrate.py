@@ -19,7 +19,6 @@ from calibray.calibration.held_out_accuracy import rmse_of
 from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.fitting import search
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import choose
 from calibray.optimizers import METHODS
@@ -276,9 +275,7 @@ def test_weights_act(tmp_path, exact):
         ({"per": "half", "bounds": [-10.0, 10.0]}, {"west": -3.0, "east": 6.0}, {"west": -3.0, "east": 6.0}),
     ],
 )
-def test_offsets_are_fitted_with_the_materials(tmp_path, exact, monkeypatch, offset, planted_db, found):
-    """An offset of every half of the links adds minima, which need more starting points than other tests have."""
-    monkeypatch.setattr(search, "STARTS", (64, 64))
+def test_offsets_are_fitted_with_the_materials(tmp_path, exact, offset, planted_db, found):
     shifted = exact.assign(path_loss_db=exact.path_loss_db + exact.half.map(planted_db))
     result = run(tmp_path, shifted, offset=offset)
     assert result.nuisance.offsets_db == pytest.approx(found, abs=1e-4)

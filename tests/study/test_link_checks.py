@@ -130,6 +130,16 @@ def test_a_planted_mistake_of_links_is_named(town, mistake, named):
     assert named in suspicions(town, mistake(links()))
 
 
+def test_links_of_several_transmitters_to_a_receiver_outside_the_scene_are_counted(town):
+    frame = links()
+    away = frame.index.isin([8, 9])
+    frame = frame.assign(x=np.where(away, 900.0, frame.x), y=np.where(away, 0.0, frame.y))
+    frame = frame.assign(mast=MAST[0] + 0.5 * (frame.index % 2))
+    text = suspicions(town, frame, links={"tx": ["mast", *MAST[1:].tolist()]})
+    assert "1 of 59 receivers are outside the scene" in text
+    assert "(links there: 2, the first in row 10)" in text
+
+
 def test_receivers_indoors_of_a_transmitter_outdoors_are_no_mistake(town):
     """All stand in two of the blocks, so that turned axes would put them outdoors; waves reach them through walls."""
     frame = links()

@@ -259,7 +259,7 @@ def _positions(study: StudyModel, overhead: SceneSurfaces, links: Measurements) 
         rows = links.row[overhead.outside(links.rx)]
         yield (
             f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where there is no ground and no "
-            f"building; {len(rows):,} links end there, the first in row {rows[0]}",
+            f"building (links there: {len(rows):,}, the first in row {rows[0]})",
             "leave out wrong positions with links.where, or create a larger scene",
         )
     if through_walls:
