@@ -166,7 +166,14 @@ def test_nearest_neighbours_approximate_the_exact_whitener():
     )
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "correlated", "out_of_sight", "student-t"])
+PLANTED = ("gaussian", "correlated", "out_of_sight", "student-t")
+
+
+def test_every_kind_is_planted():
+    assert {model.kind for model in noise_models(POSITION, out_of_sight=True)} == set(PLANTED)
+
+
+@pytest.mark.parametrize("kind", PLANTED)
 def test_planted_errors_favour_their_kind(kind):
     """For 150 links, the planted kind gets the largest weight; a planted offset is recognised."""
     random = np.random.default_rng(8)

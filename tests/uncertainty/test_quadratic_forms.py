@@ -7,15 +7,17 @@ import pytest
 
 from calibray.uncertainty import joint_model as module
 from calibray.uncertainty.joint_model import QuadraticForms
-from calibray.uncertainty.noise_models import Marginal, noise_models
+from calibray.uncertainty.noise_models import Marginal, NoiseModel, noise_models
 
 LINKS, COUNT = 30, 120
 
 
-def _marginal(columns, censored=None):
+def _marginal(columns, censored=None, further=None):
     random = np.random.default_rng(1)
     position = random.uniform(0, 300, (LINKS, 3))
-    models = list(noise_models(position, censored=censored is not None))
+    models = list(noise_models(position, censored=censored is not None, out_of_sight=censored is None))
+    if further:
+        models.append(further)
     if censored is not None:
         models = [model for model in models if model.kind != "correlated"]
     return Marginal.of(
@@ -26,6 +28,7 @@ def _marginal(columns, censored=None):
         3.0,
         models,
         censored,
+        random.normal(15, 8, LINKS),
     )
 
 
@@ -48,6 +51,18 @@ def test_each_density_is_that_of_its_model(columns, most, monkeypatch):
     assert np.isneginf(found[3])
     there = np.arange(COUNT) != 3
     assert found[there] == pytest.approx(wanted[there], abs=1e-3)
+
+
+def test_a_kind_without_quadratic_form_uses_the_density_of_its_model():
+    """The recipe for a noise model requires a density, and no change of the quadratic forms."""
+    marginal = _marginal(2, further=NoiseModel("logistic", 0.1))
+    gap, _ = _asked(marginal)
+    forms, last = QuadraticForms.of(marginal), len(marginal.models) - 1
+    assert [form is None for form in forms.square] == [
+        model.kind in ("student-t", "logistic") for model in marginal.models
+    ]
+    found, wanted = forms.densities(gap, np.full(COUNT, last)), marginal.densities(gap)[:, last]
+    assert np.delete(found, 3) == pytest.approx(np.delete(wanted, 3))
 
 
 def test_censored_links_use_the_full_density():

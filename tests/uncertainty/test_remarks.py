@@ -20,13 +20,15 @@ from link_tables import links_from_frame
 NAMES = tuple(planted.TRUTH)
 
 
-def remarks(optimum: dict[str, float], log_odds: float = 3.0, **sections: Any) -> tuple[str, ...]:
+def remarks(
+    optimum: dict[str, float], log_odds: float = 3.0, noise: Any = None, **sections: Any
+) -> tuple[str, ...]:
     study = Study.from_content(planted.content("links.csv", **{"noise": None, **sections}))
     setup = Setup.open(study, links=links_from_frame(planted.links()))
     problem = Problem.of(setup, Replay(planted.engine().paths, setup.parameters))
     pieces = ((2.0, 3.0), (6.0, 9.0))
     intervals = {name: Interval(0.1, 2.0, 9.0, Verdict.AMBIGUOUS, pieces) for name in NAMES}
-    probable, noise = dict.fromkeys(NAMES, 7.0), {CORRELATED: 0.9, "gaussian": 0.1}
+    probable, noise = dict.fromkeys(NAMES, 7.0), noise or {CORRELATED: 0.9, "gaussian": 0.1}
     found = outside_interval(problem, optimum, intervals, probable, log_odds, noise)
     assert all(remark.kind is RemarkKind.OUTSIDE_INTERVAL for remark in found)
     return tuple(map(remark_text, found))
@@ -68,6 +70,11 @@ def test_values_as_probable_as_any_are_not_called_less_probable(log_odds):
     assert "times as probable" not in text
     assert "not the most probable" not in text
     assert "No other candidate is clearly more probable" in text
+
+
+def test_a_cause_without_its_own_sentence_is_another_noise_model():
+    text = remarks(dict.fromkeys(NAMES, 4.0), noise={"logistic": 0.9, CORRELATED: 0.1, "offset": 1.0})[0]
+    assert "because their noise model differs from the one that the RMSE assumes" in text
 
 
 def test_noise_that_the_data_favour_is_reported():

@@ -204,7 +204,8 @@ def _outside_interval(values: dict[str, Any]) -> str:
         text = (
             f"The candidate with the lowest RMSE is not the most probable one: {'; '.join(map(''.join, parameters))}. "
             "The RMSE treats the noise of all links as independent; the intervals do not, because "
-            f"{_CAUSES[values['cause']]}. The most probable values are {times} times as probable."
+            f"{_CAUSES.get(values['cause'], _CAUSES['gaussian'])}. "
+            f"The most probable values are {times} times as probable."
         )
     text += " Do not use the values with the lowest RMSE as material constants."
     if values["blocks"]:

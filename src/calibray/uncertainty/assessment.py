@@ -33,7 +33,7 @@ from calibray.uncertainty.buildings import can_split
 from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
-from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OUT_OF_SIGHT
+from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, HEAVY, OFFSET, OUT_OF_SIGHT
 from calibray.uncertainty.remarks import (
     conflict,
     departures,
@@ -264,7 +264,7 @@ def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> 
         weights[DIFFERING] = float(weight[posterior.spread > 0].sum())
     if offset:
         with_offset = np.array([each.offset for each in models])
-        weights["offset"] = float(by_model[with_offset].sum())
+        weights[OFFSET] = float(by_model[with_offset].sum())
     return weights
 
 

@@ -50,8 +50,8 @@ class QuadraticForms:
 
     Attributes:
         marginal: The density.
-        group: Group of each model; models of one group are evaluated together [models]. It is the model's own index for
-            a Gaussian model, -1 for Student's t, and -2 for gross errors.
+        group: Group of each model; models of one group are evaluated together [models]. It is -1 for Student's t, -2
+            for gross errors, and otherwise the model's own index.
         square: For each Gaussian model, the matrix [m, m], constant and exponent of its quadratic form; None for other
             models. Empty if there are too many links or any censored links.
     """
@@ -67,7 +67,7 @@ class QuadraticForms:
         group = [(-2 if model.gross else -1) if model.kind == HEAVY else k for k, model in enumerate(models)]
         if len(marginal.column) > MAX_LINKS or marginal.censored.any():
             return cls(marginal, np.array(group), ())
-        square = (None if model.kind == HEAVY else marginal.form(model) for model in models)
+        square = (marginal.form(model) if marginal.is_gaussian(model) else None for model in models)
         return cls(marginal, np.array(group), tuple(square))
 
     def densities(self, gap: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -82,9 +82,12 @@ class QuadraticForms:
         group = self.group[model]
         for index in np.unique(group[finite]).tolist():
             rows = finite & (group == index)
-            form = self.square[index] if index >= 0 else None
-            if form is None:
+            if index < 0:
                 log_density[rows] = self.marginal.heavy(gap[rows], [models[k] for k in model[rows].tolist()])
+            elif (form := self.square[index]) is None:
+                # The weight is added below.
+                alone = replace(self.marginal, models=(replace(models[index], weight=1.0),))
+                log_density[rows] = alone.densities(gap[rows])[:, 0]
             else:
                 square, constant, exponent = form
                 value = np.sum((gap[rows] @ square) * gap[rows], axis=1)

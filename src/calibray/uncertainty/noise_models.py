@@ -115,6 +115,9 @@ GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_si
 DIFFERING: Final = "heterogeneous"
 """Name of the hypothesis that buildings differ, which has a posterior weight like the kinds of noise."""
 
+OFFSET: Final = "offset"
+"""Name of the hypothesis of an undeclared offset, which has a posterior weight like the kinds of noise."""
+
 
 @dataclass(frozen=True)
 class NoiseModel:
@@ -299,6 +302,10 @@ class Marginal:
                 value = _plain(gap, design, ridge)
             log_density[finite, index] = value + np.log(model.weight)
         return log_density
+
+    def is_gaussian(self, model: NoiseModel) -> bool:
+        """Whether the errors of a model are Gaussian, independent or not."""
+        return model.kind == GAUSSIAN or (model.kind, model.range, model.share) in self.whiteners
 
     def form(self, model: NoiseModel) -> tuple[NDArray[np.float64], float, float]:
         """Matrix Q [m, m] and constants c and h of a Gaussian model: the log density of gaps g is c - h log g'Q g."""

@@ -30,7 +30,7 @@ from calibray.study.model import StudyModel
 from calibray.tracing.settings import RANGES
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import has_offset
-from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OUT_OF_SIGHT
+from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OFFSET, OUT_OF_SIGHT
 
 SIGNIFICANT: Final = 0.005
 """A conflict is reported if the probability of a larger increase without a conflict is below this value. Errors that
@@ -175,8 +175,6 @@ DEPARTURES: Final = {
     DIFFERING: RemarkKind.HETEROGENEITY,
 }
 
-CAUSES: Final = (CORRELATED, OUT_OF_SIGHT, HEAVY, DIFFERING, GAUSSIAN)
-
 
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
     """A remark for each noise model that the data favour over independent Gaussian noise, from the posterior weights.
@@ -259,7 +257,7 @@ def outside_interval(
         "values": [float(optimum[name]) for name in outside],
         "pieces": [[float(end) for piece in intervals[name].pieces for end in piece] for name in outside],
         "most_probable": [float(most_probable[name]) for name in outside],
-        "cause": max(CAUSES, key=lambda kind: noise.get(kind, 0.0)),
+        "cause": max((kind for kind in noise if kind != OFFSET), key=lambda kind: noise[kind]),
         "odds": float(np.exp(np.clip(log_odds, 0.0, np.log(MOST_ODDS)))),
         "blocks": problem.setup.study.holds_out_blocks,
     }
