@@ -1,6 +1,6 @@
-"""Measured links: positions, path losses, weights and groups, read from tables and checked.
+"""Read measured links from tables and check their positions, path losses, weights and groups.
 
-`reading.measured_links` converts the rows of a table to `Measurements`.
+`reading.measured_links` converts the rows of a table to a `Measurements` object.
 """
 
 from calibray.measurements.links import FEW as FEW

@@ -1,4 +1,4 @@
-"""Infer the contents of the columns of a table from the words in the column names and from the values."""
+"""Infer what each column of a table contains from its name and its values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DEVICES: Final = (
     "(tele)?phone|smartphone|terminale?|empf(a|ae)nger|(end|mess)?ger(a|ae)t|(mobil)?telefon|handy|receptor|"
     "dispositivo|telefono|movil|celular|recepteur|appareil|ricevitore|apparecchio|cellulare"
 )
-"""Pattern of words for receiving devices in English, German, Spanish, French and Italian."""
+"""Regular expression for words that mean a receiving device in English, German, Spanish, French and Italian."""
 
 PATTERNS: Final = {
     # The possible contents of a column, and the regular expression that a whole word of its name must match.
@@ -68,8 +68,8 @@ PATTERNS: Final = {
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Recognized spellings of column names, without accents. To add a spelling, extend its row. Case and punctuation are
-ignored."""
+"""Recognized words in column names, without accents, by content of the column. Case and punctuation are ignored. To add
+a word, extend the pattern of its content."""
 
 LENGTH_UNITS: Final = {
     "cm": 0.01,
@@ -80,24 +80,24 @@ LENGTH_UNITS: Final = {
     "foot": 0.3048,
     "inch": 0.0254,
 }
-"""Units of length other than the metre that column names can state, with the length of each unit [m]."""
+"""Units of length, other than the metre, that can appear in column names, and their lengths [m]."""
 
 WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
-"""Words in a column name that indicate powers in a unit other than dBm."""
+"""Words in a column name that indicate powers in watts or dBW instead of dBm."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-"""Units of carrier frequency that column names can state, with the value of each unit in hertz."""
+"""Units of frequency that can appear in column names, and their values in hertz."""
 
 
 @dataclass(frozen=True)
 class PositionColumns:
-    """The columns with the position of one end of a link.
+    """Columns that contain the position of one end of a link.
 
     Attributes:
-        position: "scene" for metres, "geographic" for degrees.
+        position: "scene" for coordinates in metres, "geographic" for degrees.
         x: Column of x coordinates, or of longitudes.
         y: Column of y coordinates, or of latitudes.
-        height: Column of heights; None if there is no such column.
+        height: Column of heights; None if the table has no heights.
     """
 
     position: Literal["scene", "geographic"]
@@ -122,7 +122,7 @@ class ValueColumn:
 
 
 def without_accents(name: object) -> str:
-    """A name without accents.
+    """Remove the accents from a name.
 
     Example:
         >>> without_accents("Höhe (straße)")
@@ -133,7 +133,7 @@ def without_accents(name: object) -> str:
 
 
 def words(name: object) -> frozenset[str]:
-    """Words in a column name, in lower case. A camel-case word is included both as a whole and in parts.
+    """Split a column name into lower-case words. A camel-case word is included both whole and split.
 
     Example:
         >>> sorted(words("Rx_X [m]"))
@@ -159,7 +159,7 @@ def words(name: object) -> frozenset[str]:
 
 
 def matches(name: object, *rows: str) -> bool:
-    """Whether a word in a column name matches one of the given rows of `PATTERNS`.
+    """Whether any word of a column name matches one of the given entries of `PATTERNS`.
 
     Example:
         >>> matches("RSRP [dBm]", "received power"), matches("RSRP [dBm]", "x", "y")
@@ -169,7 +169,7 @@ def matches(name: object, *rows: str) -> bool:
 
 
 def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Find the column of round-trip times or times of flight, with its kind and unit; None if there is no such column.
+    """Find a column of round-trip times or times of flight, and determine its kind and unit; None if there is none.
 
     Some Wi-Fi devices report a distance in metres instead of a time.
 
@@ -191,7 +191,7 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
 
 
 def find_delay_spread(frame: pd.DataFrame) -> tuple[str, str] | None:
-    """Find the column of delay spreads, with its unit; None if there is no such column.
+    """Find a column of delay spreads and its unit; None if there is no such column.
 
     Example:
         >>> find_delay_spread(pd.DataFrame({"ds_std_ns": [2.0], "RMS Delay Spread [ns]": [80.0]}))
@@ -205,7 +205,7 @@ def find_delay_spread(frame: pd.DataFrame) -> tuple[str, str] | None:
 
 
 def _unit_of_delay(name: str, *others: str) -> str | None:
-    """The unit of time, or one of the other units, that a column name states; None if it states none of them."""
+    """Find a unit of time, or one of `others`, in a column name; None if the name contains no such unit."""
     return next((unit for unit in ("ps", "ns", "us", "ms", "s", *others) if unit in words(name)), None)
 
 
@@ -219,7 +219,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Hint about a column that matches one of the given rows of `PATTERNS` but is not numeric; empty if there is none.
+    """Hint about a column whose name matches one of the given entries of `PATTERNS` but which contains text, or "".
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
@@ -236,7 +236,7 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint about a longitude or latitude column that does not contain degrees; empty if there is no such column.
+    """Hint about a column of longitudes or latitudes that are not in degrees; empty if there is no such column.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
@@ -253,9 +253,9 @@ def no_degrees(frame: pd.DataFrame) -> str:
 
 
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
-    """Find the columns with the position of one end of a link; metres take precedence over degrees.
+    """Find the columns with the position of one end of a link; metres are preferred to degrees.
 
-    With `unnamed`, columns whose names indicate neither transmitter nor receiver can also belong to this end.
+    With `unnamed`, columns whose names mention neither the transmitter nor the receiver also qualify.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -280,9 +280,9 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
 
 
 def _height(names: Iterable[str]) -> str | None:
-    """The first column of antenna heights, or else of other heights.
+    """Find the first column of antenna heights or, failing that, of other heights.
 
-    Heights of the ground or of buildings are ignored, as are speeds such as "Speed km h".
+    Heights of the ground or of buildings are ignored, and so are speeds such as "Speed km h".
     """
     heights = [
         name for name in names if matches(name, "height") and not matches(name, "another height", "speed")
@@ -291,19 +291,19 @@ def _height(names: Iterable[str]) -> str | None:
 
 
 def find_transmitter_height(frame: pd.DataFrame) -> str | None:
-    """Name of the column of transmitter heights, or None."""
+    """Find the column of transmitter heights; None if there is no such column."""
     return _first([name for name in numeric_columns(frame) if matches(name, "transmitter")], "height")
 
 
 def find_value(table: SourceTable) -> ValueColumn:
-    """Find the column of measured values, and the measured quantity.
+    """Find the column of measured values and identify the measured quantity.
 
-    Path loss takes precedence over path gain, and path gain over received power. Received powers other than those of
-    reference signals come last if their names state no decibel unit. The sign of the values distinguishes loss from
-    gain.
+    Path loss is preferred to path gain, and path gain to received power. Columns of received power other than that of
+    reference signals come last if their names contain no decibel unit. Whether a column is a loss or a gain follows
+    from the sign of its values.
 
     Raises:
-        InputError: No column appears to contain measured values.
+        InputError: No column appears to contain path loss, path gain or received power.
     """
     kinds: tuple[tuple[str, Quantity], ...] = (
         ("path loss", "path_loss"), ("path gain", "path_gain"), ("received power", "rsrp"),
@@ -344,7 +344,7 @@ def find_value(table: SourceTable) -> ValueColumn:
 
 
 def find_transmit_power(frame: pd.DataFrame) -> str | None:
-    """Name of the column of transmitted powers [dBm], or None; columns in watts or dBW are ignored.
+    """Find the column of transmitted powers [dBm], or None; columns in watts or dBW are ignored.
 
     Example:
         >>> find_transmit_power(pd.DataFrame({"tx_power_w": [20.0], "EIRP [dBW]": [30.0], "TX power (dBm)": [43.0]}))
@@ -359,10 +359,10 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
 
 
 def find_length_unit(names: Iterable[str]) -> float:
-    """The unit of length that column names state [m]; 1 if no name states a unit.
+    """Find the unit of length in column names, as its length [m]; 1 if no name contains a unit.
 
     Raises:
-        InputError: The names state different units.
+        InputError: The names contain different units.
 
     Example:
         >>> find_length_unit(["X [cm]", "Y [cm]", "device"]), find_length_unit(["x", "y_m"])
@@ -377,7 +377,7 @@ def find_length_unit(names: Iterable[str]) -> float:
 
 
 def find_frequency_unit(name: str, default: str = "hz") -> float:
-    """The unit of carrier frequency that a column name states, in hertz; `default` if the name states no unit.
+    """Find the unit of frequency in a column name, in hertz; `default` if the name contains no unit.
 
     Example:
         >>> find_frequency_unit("Downlink [MHz]"), find_frequency_unit("carrier")
@@ -387,10 +387,10 @@ def find_frequency_unit(name: str, default: str = "hz") -> float:
 
 
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
-    """Find the column of carrier frequencies, and the frequency of each row [Hz]; None if there is no such column.
+    """Find the column of carrier frequencies and convert its values to hertz; None if there is no such column.
 
-    The column name contains a word for frequency or a unit of frequency. The unit is read from the name if possible,
-    and otherwise inferred from the magnitude of the values.
+    The name of this column contains a word for frequency or a unit of frequency. If the name contains no unit, the unit
+    is inferred from the magnitude of the values.
 
     Example:
         >>> find_frequency(pd.DataFrame({"BW [MHz]": [20.0], "Frq [MHz]": [763.0]}))
@@ -410,7 +410,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def no_frequency(frame: pd.DataFrame) -> str:
-    """Hint about a column of carrier frequencies whose values are out of range; empty if there is no such column.
+    """Hint about a column of carrier frequencies that are out of range; empty if there is no such column.
 
     Example:
         >>> no_frequency(pd.DataFrame({"Frequency (Hz)": [1842.5]}))
@@ -426,7 +426,7 @@ def no_frequency(frame: pd.DataFrame) -> str:
 
 
 def _frequency_columns(frame: pd.DataFrame) -> list[str]:
-    """Columns of numbers with a word for frequency in their names, followed by those with a unit of frequency."""
+    """Numeric columns whose names contain a word for frequency, followed by those that contain only its unit."""
     names = numeric_columns(frame)
     in_hertz = [
         name for name in names if words(name) & {*FREQUENCY_UNITS} and not matches(name, "bandwidth or shift")
@@ -435,22 +435,22 @@ def _frequency_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def find_time(frame: pd.DataFrame) -> str | None:
-    """Name of the first column whose name indicates times, or None."""
+    """Find the first column whose name indicates times; None if there is no such column."""
     return _first([str(name) for name in frame], "time")
 
 
 def find_distance(frame: pd.DataFrame) -> str | None:
-    """Name of the column of distances from transmitter to receiver, or None."""
+    """Find the column of distances from transmitter to receiver; None if there is no such column."""
     return _first(numeric_columns(frame), "distance")
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be degrees; in some tables, columns named longitude and latitude are in metres."""
+    """Whether coordinates can be in degrees: in some tables, columns named longitude and latitude contain metres."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 
 def is_named_value(name: str) -> bool:
-    """Whether a name contains a word for a measured value."""
+    """Whether a column name contains a word for path loss, path gain or received power."""
     return matches(name, "path loss", "path gain", "received power")
 
 
@@ -459,7 +459,7 @@ def _first(names: Iterable[str], row: str) -> str | None:
 
 
 def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
-    """Whether values are plausible for a quantity; the sign of a loss or gain is ignored."""
+    """Whether the median of the values is plausible for a quantity; the sign of a loss or gain is ignored."""
     median = float(np.nanmedian(values)) if values.notna().any() else 0.0
     # The median is used because individual values may be logging errors.
     return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

@@ -1,4 +1,4 @@
-"""Read text tables written by loggers and spreadsheets: encoding, separator, header, units, placeholders."""
+"""Read text tables written by loggers and spreadsheets; detect their encoding, separator, header and units."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import shortened
 
 SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
-"""Extensions of text tables."""
+"""File extensions of text tables."""
 
 PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
-"""Strings that represent a missing number in a column of numbers."""
+"""Strings that stand for a missing number in a column of numbers."""
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
@@ -31,20 +31,20 @@ UNITS: Final = frozenset({
     "\u03bcs", "ns", "min", "h", "%", "v", "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string",
     "text", "int", "float",
 })  # fmt: skip
-"""Units that a row of units below the header can contain, in lower case."""
+"""Units, in lower case, that are recognized in a row of units below the header."""
 
 _HEAD: Final = 64  # number of records from which the layout of a file is detected
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """The layout of a text table.
+    """Layout of a text table.
 
     Attributes:
-        separator: Column separator; a space represents any white space.
+        separator: Column separator; a space stands for any spaces and tabs.
         skipped: Number of lines above the header.
-        units: Unit of each column, from a row of units below the header; empty if there is no such row.
-        unit_lines: First line of the row of units and the line after its end, relative to the first line of the header.
+        units: Unit of each column, from the row below the header; empty if this row contains no units.
+        unit_lines: Indices of the first line of the row of units and of the line after it, counted from the header.
     """
 
     separator: str
@@ -54,7 +54,7 @@ class _Layout:
 
 
 def read_text(path: Path) -> str:
-    """Read a file as text in UTF-8 or UTF-16, or else in Windows-1252.
+    """Read a text file encoded in UTF-8, UTF-16 or, failing these, Windows-1252.
 
     Raises:
         InputError: The file cannot be read, is an archive or contains bytes that are not text.
@@ -84,14 +84,14 @@ def read_text(path: Path) -> str:
 
 
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
-    r"""Read the rows of a text table, without blank lines.
+    r"""Read the rows of a text table; blank lines are ignored.
 
-    Lines above the header are skipped if they have a different number of cells or mostly empty cells. Units in a row
-    below the header are appended to the column names. In a column of numbers, cells can contain placeholders
-    (`PLACEHOLDERS`), and all numbers can be followed by the same decibel unit.
+    Lines above the header are skipped if most of their cells are empty or if their number of cells differs. Units in a
+    row below the header are appended to the column names. Cells in a column of numbers can contain placeholders
+    (`PLACEHOLDERS`). The same decibel unit can follow every number in the column.
 
     Args:
-        path: The file, for messages.
+        path: Path of the file, for messages.
         text: Content of the file.
         separator: Column separator; detected if None.
 
@@ -145,7 +145,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """Find the first line that can be the header of the rows below, and the separator that gives the most columns."""
+    """Find the first line that can be a header of the rows below, and the separator that gives the most columns."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
@@ -178,7 +178,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Cells of the first non-blank records, each with the first line of the record and the line after its end."""
+    """Split the first non-blank records into cells, with the indices of each one's first line and of the line after."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -193,7 +193,7 @@ def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]
 
 
 def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Units of the columns, and the first line and end of the row of units; empty and (0, 0) if there is none."""
+    """Units of the columns, and first line and end of the row of units; () and (0, 0) if there is no such row."""
     if len(records) < 3:
         return (), (0, 0)
     (header, *_), (cells, start, end), (below, *_) = records[:3]
@@ -210,7 +210,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _with_unit(name: object, unit: str) -> str:
-    """Name of a column with its unit appended, unless the name already contains the unit."""
+    """Append a unit to the name of a column, unless the name already contains the unit."""
     plain = str(name).strip()
     return (
         plain
@@ -220,9 +220,9 @@ def _with_unit(name: object, unit: str) -> str:
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
-    """Convert strings to numbers if each is a number, a number with the same decibel unit, or a placeholder.
+    """Convert a column of strings to numbers, which may be placeholders or have a common decibel unit.
 
-    Otherwise, only leading and trailing white space is removed.
+    If another string occurs, only leading and trailing white space is removed.
     """
     if not pd.api.types.is_string_dtype(column):
         return column
@@ -239,10 +239,10 @@ def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
 
 
 def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
-    """The decimal mark of the numbers in a CSV text.
+    """Find the decimal mark of the numbers in a CSV text.
 
     Raises:
-        InputError: The decimal mark is not the same in all numbers, or could be a thousands separator.
+        InputError: Decimal marks differ between numbers, or could be thousands separators.
     """
     lines: dict[str, int] = {}
     # The first cell like 1,234 in each column, and the columns with whole numbers of at most four characters.
@@ -276,12 +276,13 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Header of a CSV text and line number of each row; faults that pandas would silently correct are refused.
+    """Read the header of a CSV text and the line number of each row; refuse faults that pandas would correct silently.
 
-    The third result is whether every row ends with an additional empty cell.
+    The third result is true if every row ends with an additional empty cell.
 
     Raises:
-        InputError: A column appears twice, or a row has more or fewer cells than the header.
+        InputError: The header contains only numbers or names a column twice, or a row has more or fewer cells than the
+            header.
     """
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=layout.separator, skipinitialspace=True)
     header: list[str] = []

@@ -1,8 +1,8 @@
-"""Row filters: a small, closed expression language for the columns of a table.
+"""Row filters: a small expression language for selecting the rows of a table by the values in its columns.
 
-Python parses a filter, and this module evaluates the syntax tree on whole columns, without `eval`. Only the operators,
-functions and methods listed below are allowed. Attributes, subscripts and other calls are errors. As in pandas queries,
-``&`` and ``|`` are equivalent to ``and`` and ``or``, with the same low precedence.
+Python parses a filter into a syntax tree, which this module evaluates on whole columns without calling `eval`. Only the
+operators, functions and methods listed below are allowed. Filters cannot contain subscripts, attributes or calls of
+other functions. As in pandas queries, ``&`` and ``|`` mean ``and`` and ``or`` and have the same low precedence.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ MAX_PATTERN_LENGTH: Final = 200
 """Largest number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of squared text lengths in a column for a pattern with a repetition; at this limit, a search takes 2 to
-5 s."""
+"""Largest sum of the squared lengths of the texts in a column that a pattern with a repetition may search. At this
+limit, a search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -49,19 +49,19 @@ COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }  # fmt: skip
-"""The comparison operators that a filter may use, in addition to `in` and `not in`."""
+"""Comparison operators that a filter may use, in addition to `in` and `not in`."""
 
 ARITHMETIC: Final[Mapping[type[ast.operator], Callable[[Any, Any], Any]]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.FloorDiv: operator.floordiv, ast.Mod: operator.mod, ast.Pow: operator.pow,
 }  # fmt: skip
-"""The arithmetic operators that a filter may use."""
+"""Arithmetic operators that a filter may use."""
 
 FUNCTIONS: Final[Mapping[str, np.ufunc]] = {
     name: getattr(np, name)
     for name in ("abs", "arctan2", "ceil", "cos", "exp", "floor", "log", "log10", "sin", "sqrt", "tan")
 }  # fmt: skip
-"""The functions of numbers that a filter may call."""
+"""Numeric functions that a filter may call."""
 
 
 # The functions below are the methods of columns. Their parameters are the arguments that a filter may pass.
@@ -83,7 +83,7 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse to compare a column of text with numbers alone, or a column of numbers with text alone."""
+    """Refuse to compare a column of text only with numbers, or a column of numbers only with text."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
@@ -115,7 +115,7 @@ METHODS: Final[Mapping[str, Callable[..., pd.Series]]] = {
     "isna": lambda column: column.isna(),
     "notna": lambda column: column.notna(),
 }  # fmt: skip
-"""The methods of a column."""
+"""Methods of a column that a filter may call."""
 
 TEXT_METHODS: Final[Mapping[str, Callable[..., pd.Series]]] = {
     "contains": _contains,
@@ -125,7 +125,7 @@ TEXT_METHODS: Final[Mapping[str, Callable[..., pd.Series]]] = {
     "strip": _strip,
     "upper": lambda column: column.str.upper(),
 }  # fmt: skip
-"""The methods of a column of text, after ``.str``."""
+"""Methods of a column of text that a filter may call after ``.str``."""
 
 
 def _check_types(kind: type, **values: Any) -> None:
@@ -135,7 +135,7 @@ def _check_types(kind: type, **values: Any) -> None:
 
 
 def _affix(pat: Any, na: Any) -> Any:
-    """The checked prefix or suffix of a string, or a tuple of these."""
+    """Check the prefix or suffix of a string, or a tuple of prefixes or suffixes."""
     _check_types(bool, na=na)
     for text in pat if isinstance(pat, tuple) else (pat,):
         _check_types(str, pat=text)
@@ -153,7 +153,7 @@ _REPETITION: Final = re.compile(rf"(?:{_CLASS}|\\.|[^*+?])*+[*+?]")
 
 
 def _check_pattern(pattern: str, column: pd.Series) -> None:
-    """Refuse a regular expression that is malformed, or for which a search of a column could take too long."""
+    """Refuse a regular expression that is malformed or could take too long to search a column."""
     if len(pattern) > MAX_PATTERN_LENGTH:
         raise InputError(f"{len(pattern)} characters, must be at most {MAX_PATTERN_LENGTH}; shorten it")
     try:
@@ -175,11 +175,14 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
-    """Mask [rows] of the rows that pass a filter. Missing values pass only the comparisons `!=` and `not in`.
+    """Evaluate a filter on a table, as a mask [rows] of the rows that pass.
+
+    A missing value passes only the comparisons `!=` and `not in`.
 
     Raises:
-        InputError: The filter is malformed or too large, uses an unknown column or a forbidden construct, or does not
-            give one truth value per row. The message quotes the faulty part, but not the origin of the filter.
+        InputError: The filter is malformed or too large, uses an unknown column or a forbidden construct, or is not
+            true or false for each row. The message quotes the faulty part, but does not say where the filter was
+            written.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -205,7 +208,10 @@ _TOKENS: Final = re.compile(
 
 
 def _as_python(expression: str) -> tuple[str, dict[str, str]]:
-    """A filter as a Python expression, and the column that each placeholder for a backticked name stands for."""
+    """Rewrite a filter as a Python expression, with a placeholder for each name in backticks.
+
+    The second result maps each placeholder to its column.
+    """
     stem = "quoted"
     while stem in expression:
         stem += "_"
@@ -222,7 +228,7 @@ def _as_python(expression: str) -> tuple[str, dict[str, str]]:
 
 
 def _parse(code: str, columns: Iterable[object]) -> ast.expr:
-    """The syntax tree of an expression. A malformed or excessively large expression is refused."""
+    """Parse an expression into a syntax tree. Malformed and excessively large expressions are refused."""
     try:
         tree = ast.parse(code, mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
@@ -253,7 +259,7 @@ class _Interpreter:
         self._frame, self._code, self._backticked = frame, code, backticked
 
     def value(self, node: ast.expr) -> _Value:
-        """The value of a part of the filter: a column, or a single number, string or truth value."""
+        """Evaluate part of a filter to a column or to a single number, string or truth value."""
         try:
             match node:
                 case ast.Name():
@@ -287,7 +293,7 @@ class _Interpreter:
         )
 
     def _refusal(self, node: ast.AST, fault: str) -> InputError:
-        """The error for a part of the filter. The message quotes the part as written."""
+        """Create the error for a faulty part of the filter. The message quotes this part as the user wrote it."""
         piece = ast.get_source_segment(self._code, node) or type(node).__name__
         for name, column in self._backticked.items():
             piece = piece.replace(name, f"`{column}`")
@@ -340,7 +346,7 @@ class _Interpreter:
         return value
 
     def _literals(self, node: ast.List | ast.Tuple) -> list[bool | int | float | str | None]:
-        """The values of a list or tuple: constants, numbers with a sign, and None for a missing value."""
+        """Evaluate the items of a list or tuple: constants, numbers with a sign, and None for a missing value."""
         values: list[Any] = []
         for item in node.elts:
             negative = isinstance(item, ast.UnaryOp) and isinstance(item.op, ast.USub)
@@ -451,7 +457,7 @@ class _Interpreter:
             raise self._refusal(node, str(error)) from None
 
     def _argument(self, node: ast.expr) -> Any:
-        """The value of an argument, which may also be a list or tuple of literals."""
+        """Evaluate an argument, which can also be a list or tuple of literals."""
         if isinstance(node, ast.Tuple):
             return tuple(self._literals(node))
         return self._literals(node) if isinstance(node, ast.List) else self.value(node)
@@ -475,7 +481,7 @@ def _as_floats(number: pd.Series | int | float) -> pd.Series | np.float64:
 
 
 def _overflows(operation: Callable[[Any, Any], Any], left: Any, right: Any, result: Any) -> bool:
-    """Whether a result is infinite or exceeds the integer range of its column, where it would wrap around."""
+    """Whether a result is infinite or has wrapped around because it exceeds the integer range of its column."""
     if not isinstance(result, pd.Series):
         return not isfinite(result) or (isinstance(result, int) and abs(result) > _MAX_INTEGER)
     if result.dtype.kind not in "iu" or not len(result):

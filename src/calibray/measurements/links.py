@@ -17,35 +17,35 @@ from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance below which transmitter and receiver count as coincident, so path loss is undefined [m]."""
+"""Distance below which a transmitter and a receiver count as coincident [m]. Their path loss would be undefined."""
 
 FEW: Final = 8
-"""Smallest number of links for estimating a trend, a noise model or a prediction error."""
+"""Smallest number of links from which a trend, a noise model or a prediction error is estimated."""
 
 MAX_CARRIERS: Final = 32
-"""Largest number of carrier frequencies; a column with more values probably contains a different quantity."""
+"""Largest number of carrier frequencies. A column with more distinct values probably contains a different quantity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements:
-    """Links, each with one measured path loss. The arrays are read-only copies.
+    """Links and their measured path losses. All arrays are read-only copies of the arguments.
 
     Attributes:
         tx: Transmitter positions [links, 3], [m].
         rx: Receiver positions [links, 3], [m].
-        path_loss_db: Measured path loss [links], [dB]; all NaN for links without measured values.
-        weight: Relative weights [links], [1], greater than 0; 1 unless given.
-        group: Group label of each link [links], or None.
+        path_loss_db: Measured path loss [links], [dB]; all NaN if the links have no measured values.
+        weight: Relative weights [links], [1], greater than 0; 1 by default.
+        group: Group label of each link [links]; None if the links have no groups.
         frequency: Carrier frequency of each link [links], [Hz]; None if all links have the carrier of the study.
         limit_db: Largest measurable path loss [links], [dB]; None if unknown.
-        censored: Mask [links] of the censored links, whose path loss is at least `path_loss_db`; None if no link is
+        censored: Mask [links] of the censored links, for which `path_loss_db` is a lower bound; None if no link is
             censored.
-        table: The rows of the source table, for filters and messages; by default, one empty row per link.
+        table: Rows of the source table, for filters and messages; by default, one empty row per link.
 
     Raises:
-        InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
-            positive, a carrier frequency is implausible, there are too many carriers, or only some path losses are
-            finite.
+        InputError: The shapes of the arrays disagree. A position is not finite, or a transmitter coincides with its
+            receiver. A weight is not positive and finite. A carrier frequency is out of range, or there are too many
+            carriers. A path loss is infinite, or only some links have a path loss.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -108,22 +108,22 @@ class Measurements:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows of the source table, one per link, with all columns."""
+        """Rows of the source table, with all columns, one per link."""
         return self.table.frame
 
     @property
     def row(self) -> NDArray[np.int64]:
-        """The line number [links] of each link in the source file."""
+        """Line number of each link in the source file [links]."""
         return self.table.row
 
     @property
     def source(self) -> str:
-        """The name of the source file."""
+        """Name of the source file."""
         return self.table.source
 
     @property
     def prepared(self) -> dict[str, int]:
-        """Changes to the rows of the table, such as exclusion or averaging, each with the number of affected rows."""
+        """Number of table rows affected by each change, such as a filter or averaging."""
         return dict(self.table.changes)
 
     @property
@@ -133,17 +133,17 @@ class Measurements:
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """Straight-line distance from transmitter to receiver [links], [m]."""
+        """Straight-line distances from transmitter to receiver [links], [m]."""
         return np.linalg.norm(self.rx - self.tx, axis=1)
 
     @property
     def group_names(self) -> tuple[str, ...]:
-        """The sorted names of the groups; a single empty name if the links have no groups."""
+        """Sorted names of the groups; a single empty name if the links have no groups."""
         return ("",) if self.group is None else tuple(map(str, np.unique(self.group)))
 
     @property
     def group_index(self) -> NDArray[np.int64]:
-        """The index of each link's group in `group_names` [links]."""
+        """Index of each link's group in `group_names` [links]."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
         # Every group is among the sorted names, so the insertion point is its index.
@@ -163,7 +163,7 @@ class Measurements:
         """Select the links for which a mask [links] is true.
 
         Raises:
-            InputError: The mask does not have one truth value per link, or selects no link.
+            InputError: The mask is not a Boolean array with one value per link, or selects no link.
         """
         chosen = np.asarray(mask)
         if chosen.dtype != np.bool_ or chosen.shape != (len(self),):
@@ -185,7 +185,9 @@ class Measurements:
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that pass a filter on the columns of the source table and on `POSITION_COLUMNS`.
+        """Mask [links] of the links that pass a filter.
+
+        The filter can use the columns of the source table and `POSITION_COLUMNS`.
 
         Raises:
             InputError: The filter is not valid (see `SourceTable.where`).
@@ -195,7 +197,7 @@ class Measurements:
         return self.table.assign(**missing).where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that a filter holds out: at least one, but not all.
+        """Mask [links] of the links that a filter selects as held-out links: at least one, but not all.
 
         Raises:
             InputError: The filter is not valid, or holds out no link or every link.
@@ -210,7 +212,7 @@ class Measurements:
 
 
 def _as_array(name: str, values: ArrayLike, dtype: type) -> NDArray[np.generic]:
-    """A copy of the values as an array, with NaN in place of masked numbers."""
+    """Copy values to an array, with NaN in place of masked numbers."""
     try:
         if isinstance(values, np.ma.MaskedArray) and dtype is np.float64:
             return np.where(np.ma.getmaskarray(values), np.nan, np.ma.getdata(values).astype(dtype))
@@ -264,7 +266,7 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
 
 
 def _summary(links: Measurements) -> Table:
-    """Summary table of the links: source, number and ranges of values."""
+    """Summary table of the links, with their source, number and ranges of values."""
     kind = "measured" if links.measured else "unmeasured"
     rows = [("number", f"{len(links):,} {kind}"), ("distance", _range(links.distance, "m"))]
     if links.measured:

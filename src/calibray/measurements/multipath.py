@@ -1,8 +1,8 @@
-"""Observables of links from measured multipath components: delays, powers and angles of paths.
+"""Compute observables of links from the delays, powers and angles of measured multipath components.
 
-Each observable is the same statistic as in the model, except that components outside the dynamic range of the receiver
-are cut off sharply. If a link was measured several times, for example with a rotated array, the snapshots are averaged.
-Impulse responses are converted to components: the samples above a threshold.
+Each observable is defined as in the model, except that components outside the receiver's dynamic range are cut off
+sharply. Repeated snapshots of a link, for example from a rotated array, are averaged. Samples of impulse responses
+above a threshold are treated as components.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ ANGLE: Final = {
 END: Final = {"departure": r"(^|_)([aze]od|departure|tx)(_|$)", "arrival": r"(^|_)([aze]oa|arrival|rx)(_|$)"}
 SNAPSHOT: Final = r"(^|_)(rotation|snapshot|sweep|scan|repetition|orientation)(_|$)"
 ANGLES: Final = (*(kind for kind, unit in kinds.KINDS.items() if unit == "rad"), *kinds.SECTORS)
-"""Kinds of statistics that need angles."""
+"""Kinds of statistics that require measured angles."""
 
 SECONDS: Final = {"ps": 1e-12, "ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 RADIANS: Final = frozenset({"rad", "radian", "radians"})
-"""Words in a column name that indicate angles in radians instead of degrees."""
+"""Words in a column name that indicate angles in radians rather than degrees."""
 
 LEAST_LOSS_DB: Final = 40.0
-"""Path loss in free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is a code for a missing value if the magnitudes of
-all other levels exceed this value. Levels relative to the strongest component also contain 0 dB, but some others have
-smaller magnitudes."""
+"""Path loss in free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is treated as a code for a missing value if the
+magnitudes of all other levels exceed this loss. Levels relative to the strongest component also include 0 dB, but the
+magnitudes of other levels are then smaller."""
 
 LONGEST: Final = 0.01
 """Largest plausible delay [s]; light travels 3,000 km in this time."""
@@ -63,12 +63,12 @@ class Multipath:
     """Measured multipath components of links.
 
     Attributes:
-        link: Label of the link of each component [n].
+        link: Label of the link to which each component belongs [n].
         snapshot: Label of the snapshot in which each component was measured [n].
         delay: Delay [n], [s].
         level_db: Power gain [n], [dB].
-        angles: Azimuths, counter-clockwise from the x axis, and elevations or zenith angles [n], [rad], by plane and
-            end, such as ("azimuth", "arrival").
+        angles: Azimuths (counter-clockwise from the x axis) and elevations or zenith angles [n], [rad]. The keys are a
+            plane and an end, such as ("azimuth", "arrival").
     """
 
     link: NDArray[np.str_]
@@ -83,19 +83,20 @@ def read_multipath(
 ) -> Multipath:
     """Read a table with one row per multipath component.
 
-    The columns are recognized by name: a delay (`delay_ns`), a path loss, path gain or power [dB] (`path_loss_db`),
-    and, if present, an azimuth, an elevation, and the number of the rotation or snapshot. An angle is used for both
-    ends unless the column name states an end (`aoa_deg`, `azimuth_tx`).
+    Columns are recognized by name: the delay (`delay_ns`) and the path loss, path gain or power [dB] (`path_loss_db`).
+    Azimuth, elevation, and the number of the rotation or snapshot are optional. An angle is used for both ends of the
+    link unless the column name specifies one end (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
-        link: Column of the link labels.
+        link: Column that contains the labels of the links.
         compass: Whether azimuths are compass bearings, clockwise from north.
-        missing: Numbers that represent missing delays or levels; components with such a number are left out.
+        missing: Numbers that stand for missing delays or levels. Components with one of these numbers are left out.
 
     Raises:
-        InputError: The table cannot be read, has no column of links, delays or powers, or has several columns of delays
-            or powers. Delays or powers do not match the unit or sign that the column names imply, or are not plausible.
+        InputError: The table cannot be read, lacks the column of links, delays or powers, or has several columns of
+            delays or powers. Delays or powers are implausible or do not match the unit or sign implied by the column
+            name.
     """
     table = read_table(path)
     # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
@@ -176,7 +177,7 @@ def read_multipath(
 
 
 def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
-    """Refuse codes for missing values and impossible values among the delays and levels of components.
+    """Refuse components whose delay or level is impossible or a code for a missing value.
 
     Raises:
         InputError: A value is not plausible.
@@ -197,13 +198,14 @@ def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
-    """Compute a statistic of each link in SI units, averaged over the snapshots of the link, by link label.
+    """Compute a statistic for each link in SI units, averaged over its snapshots; the keys are the labels of the links.
 
-    Snapshots with a single component have no K-factor and are excluded from the mean. Links without a component that
-    the receiver detects are excluded. The components already reflect the bandwidth of the receiver.
+    A snapshot with a single component has no K-factor and is excluded from the mean. Links without any component that
+    the receiver detects are excluded. The bandwidth of the receiver is not applied, because it has already shaped the
+    measured components.
 
     Raises:
-        InputError: The statistic requires angles that were not measured.
+        InputError: The statistic requires angles, but they were not measured or are in several columns.
 
     Example:
         >>> paths = Multipath(np.array(["a", "a"]), np.array(["", ""]), np.array([1e-7, 2e-7]), np.zeros(2))
@@ -230,7 +232,7 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
 
 
 def _seen(multipath: Multipath, index: NDArray[np.int64], statistic: Statistic) -> NDArray[np.int64]:
-    """The components of a snapshot that the receiver detects."""
+    """Select the components of a snapshot that the receiver detects."""
     delay, level_db = multipath.delay[index], multipath.level_db[index]
     seen = np.isfinite(level_db)
     if statistic.floor_db is not None:
@@ -245,7 +247,7 @@ def _seen(multipath: Multipath, index: NDArray[np.int64], statistic: Statistic) 
 def _value(
     multipath: Multipath, seen: NDArray[np.int64], angle: NDArray[np.float64] | None, statistic: Statistic
 ) -> float:
-    """The statistic of the components of a snapshot, in SI units."""
+    """Compute the statistic of the components of one snapshot, in SI units."""
     delay, power = multipath.delay[seen], 10 ** (multipath.level_db[seen] / 10)
     weight, first = power / power.sum(), float(delay.min())
     mean, kind = float(np.sum(weight * delay)), statistic.kind
@@ -274,10 +276,10 @@ def _value(
 
 ENDINGS: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 MOST_BYTES: Final = 4 << 30
-"""Largest total size of the arrays in a file [bytes]."""
+"""Largest allowed total size of the arrays in a file [bytes]."""
 
 DELAYS: Final = ("delay", "delays", "tau", "time", "t")
-"""Names of the array of sample delays in a file [s]."""
+"""Recognized names of the array that contains the delays of the samples [s]."""
 
 MARGIN_DB: Final = 10.0
 """Margin by which a sample must exceed the mean noise power to be treated as signal [dB]. The power of noise samples is
@@ -287,25 +289,25 @@ exponentially distributed, so one noise sample in 22,000 exceeds this margin."""
 def read_impulse_responses(
     source: str | Path, labels: list[str], sample_rate: float | None = None, margin_db: float = MARGIN_DB
 ) -> Multipath:
-    """Read impulse responses and keep the samples of each response that exceed the noise.
+    """Read impulse responses and keep the samples that exceed the noise.
 
-    Files can be NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) or HDF5 files.
+    NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) and HDF5 files are supported.
 
-    The mean noise power of a response is estimated as the median power of its samples divided by ln 2, because noise
-    powers are exponentially distributed. Most samples of a response must therefore be noise.
+    Noise powers are exponentially distributed, so the mean noise power of a response is the median power of its samples
+    divided by ln 2. This estimate requires that most samples of a response are noise.
 
     Args:
-        source: A file with one response per link in the order of the labels, [links, samples] or [links, snapshots,
+        source: A file with one response per link, in the order of `labels`, [links, samples] or [links, snapshots,
             samples]. Alternatively, a folder with one file per link, [samples] or [snapshots, samples].
         labels: Labels of the links.
-        sample_rate: Samples per second [Hz]; None if the files state delays [s].
+        sample_rate: Sample rate [Hz]; None if the files contain the delays of the samples [s].
         margin_db: Margin by which a sample must exceed the mean noise power to become a component [dB].
 
     Returns:
-        The samples above the threshold as components, with their powers.
+        One component per sample above the threshold.
 
     Raises:
-        InputError: A file cannot be read, or the array does not match the links.
+        InputError: A file cannot be read, or the shape of its array does not match the links.
     """
     source = Path(source)
     parts = []
@@ -334,7 +336,7 @@ def read_impulse_responses(
 def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
-    """Link, snapshot, delay and level of the samples above the noise in a link's responses [snapshots, samples]."""
+    """Link, snapshot, delay and level of each sample above the noise in a link's responses [snapshots, samples]."""
     # Squares of small integer types, such as converter samples, would wrap around.
     power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
@@ -344,7 +346,7 @@ def _above_noise(
 
 
 def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """The array of responses in a file, and the delays of its samples [s]."""
+    """Read the array of responses in a file and the delays of its samples [s]."""
     with _explained(file):
         arrays = _arrays(file)
     delays = next((arrays.pop(name) for name in list(arrays) if name.lower() in DELAYS), None)
@@ -386,7 +388,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
 
 
 def _arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """The arrays in a file, by name."""
+    """Read the arrays in a file, by name."""
     ending = file.suffix.lower()
     if ending == ".npy":
         array = np.load(file, mmap_mode="r", allow_pickle=False)
@@ -411,7 +413,11 @@ def _arrays(file: Path) -> dict[str, NDArray[Any]]:
 
 
 def _hdf5_arrays(file: Path, reverse: bool) -> dict[str, NDArray[Any]]:
-    """The datasets at the root of an HDF5 file. MATLAB writes axes in reverse order and complex numbers as pairs."""
+    """Read the datasets at the root of an HDF5 file.
+
+    MATLAB writes the axes in reverse order and complex numbers as pairs of real and imaginary
+    parts.
+    """
     arrays = {}
     with h5py.File(file, "r") as content:
         datasets = {name: item for name in content if isinstance(item := content.get(name), h5py.Dataset)}
@@ -436,7 +442,7 @@ def _check_size(file: Path, size: int) -> None:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Convert errors raised by a library to errors that name the file."""
+    """Convert an error raised by a library to an `InputError` that names the file."""
     try:
         yield
     except InputError:
