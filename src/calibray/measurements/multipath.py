@@ -415,8 +415,7 @@ def _arrays(file: Path) -> dict[str, NDArray[Any]]:
 def _hdf5_arrays(file: Path, reverse: bool) -> dict[str, NDArray[Any]]:
     """Read the datasets at the root of an HDF5 file.
 
-    MATLAB writes the axes in reverse order and complex numbers as pairs of real and imaginary
-    parts.
+    MATLAB writes the axes in reverse order and complex numbers as pairs of real and imaginary parts.
     """
     arrays = {}
     with h5py.File(file, "r") as content:
