@@ -400,7 +400,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     ),
     RemarkKind.RICHER_PATHS: _richer_paths,
     RemarkKind.MISSED_OPTIMUM: lambda values: (
-        f"The method missed the optimum: posterior draws reach an RMSE of {values['draws_db']:.2f} dB, but the "
+        f"The method missed the optimum: posterior draws reach an objective of {values['draws_db']:.2f} dB, but the "
         f"method reached {values['found_db']:.2f} dB. The intervals describe the optimum, not the values that were "
         f"found. {_larger_budget(values)}"
     ),
