@@ -1,7 +1,8 @@
-"""The remark on calibrated values outside their intervals."""
+"""The remarks on values outside their intervals, on departures from the noise model and on a missed optimum."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,22 +14,28 @@ from calibray.fitting.problem import Problem
 from calibray.result.verdict import Interval, Remark, RemarkKind, Verdict
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
+from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.noise_models import CORRELATED
-from calibray.uncertainty.remarks import departures, outside_interval
+from calibray.uncertainty.remarks import MISSED_DB, departures, missed, outside_interval
 from link_tables import links_from_frame
 
 NAMES = tuple(planted.TRUTH)
 
 
+def problem_of(**sections: Any) -> Problem:
+    study = Study.from_content(planted.content("links.csv", **sections))
+    links = replace(links_from_frame(planted.links()), path_loss_db=planted.path_loss() + 10.0)
+    setup = Setup.open(study, links=links)
+    return Problem.of(setup, Replay(planted.engine().paths, setup.parameters))
+
+
 def remarks(
     optimum: dict[str, float], log_odds: float = 3.0, noise: Any = None, **sections: Any
 ) -> tuple[str, ...]:
-    study = Study.from_content(planted.content("links.csv", **{"noise": None, **sections}))
-    setup = Setup.open(study, links=links_from_frame(planted.links()))
-    problem = Problem.of(setup, Replay(planted.engine().paths, setup.parameters))
+    problem = problem_of(**{"noise": None, **sections})
     pieces = ((2.0, 3.0), (6.0, 9.0))
     intervals = {name: Interval(0.1, 2.0, 9.0, Verdict.AMBIGUOUS, pieces) for name in NAMES}
-    probable, noise = dict.fromkeys(NAMES, 7.0), noise or {CORRELATED: 0.9, "gaussian": 0.1}
+    probable, noise = dict.fromkeys(NAMES, 7.0), noise or {CORRELATED: 0.9, "gaussian": 0.1, "offset": 1.0}
     found = outside_interval(problem, optimum, intervals, probable, log_odds, noise)
     assert all(remark.kind is RemarkKind.OUTSIDE_INTERVAL for remark in found)
     return tuple(map(remark_text, found))
@@ -118,6 +125,25 @@ def test_the_remark_on_errors_out_of_sight_advises_what_the_study_lacks(trace, a
     study = Study.from_content(planted.content("links.csv", trace=trace))
     (remark,) = departures({"out_of_sight": 1.0}, study)
     assert remark_text(remark).endswith(advice)
+
+
+def test_a_missed_optimum_is_judged_by_the_objective():
+    """The objective includes the prior of the offset; the RMSE does not."""
+    problem = problem_of(offset={"prior_db": 0.5})
+    point = problem.parameters.to_search(np.array([[2.0, 9.0, 4.0], [5.0, 5.0, 5.0]]))
+    evaluated = problem.evaluate(point)
+    objective, rmse = evaluated.value, evaluated.rmse_db
+    assert not np.isclose(objective, rmse, atol=0.1).any()
+    lowest = float(objective.min())
+    draws = Draws(point, np.array([0.0, -1.0]), np.array([0.5, 0.5]))
+    assert missed(problem, draws, lowest + 0.9 * MISSED_DB) == ()
+    (remark,) = missed(problem, draws, lowest + 1.1 * MISSED_DB)
+    assert remark.kind is RemarkKind.MISSED_OPTIMUM
+    assert remark.values["draws_db"] == pytest.approx(lowest)
+    text = remark_text(remark)
+    assert (
+        f"an objective of {lowest:.2f} dB, but the method reached {lowest + 1.1 * MISSED_DB:.2f} dB" in text
+    )
 
 
 def test_the_method_auto_is_not_advised_to_itself():

@@ -73,11 +73,12 @@ class QuadraticForms:
     def densities(self, gap: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
         """Like `Marginal.densities`, but for each gap only under the model with the given index [n]."""
         models, log_density = self.marginal.models, np.full(len(gap), -np.inf)
+        log_weight = np.log([other.weight for other in models])[model]
         if not self.square:
             for index in np.unique(model).tolist():
                 rows = model == index
-                log_density[rows] = replace(self.marginal, models=(models[index],)).densities(gap[rows])[:, 0]
-            return log_density
+                log_density[rows] = self._without_form(gap[rows], index)
+            return log_density + log_weight
         finite = np.isfinite(gap).all(axis=1)
         group = self.group[model]
         for index in np.unique(group[finite]).tolist():
@@ -85,14 +86,17 @@ class QuadraticForms:
             if index < 0:
                 log_density[rows] = self.marginal.heavy(gap[rows], [models[k] for k in model[rows].tolist()])
             elif (form := self.square[index]) is None:
-                # The weight is added below.
-                alone = replace(self.marginal, models=(replace(models[index], weight=1.0),))
-                log_density[rows] = alone.densities(gap[rows])[:, 0]
+                log_density[rows] = self._without_form(gap[rows], index)
             else:
                 square, constant, exponent = form
                 value = np.sum((gap[rows] @ square) * gap[rows], axis=1)
                 log_density[rows] = constant - exponent * np.log(np.maximum(value, 1e-300))
-        return log_density + np.log([other.weight for other in models])[model]
+        return log_density + log_weight
+
+    def _without_form(self, gap: NDArray[np.float64], index: int) -> NDArray[np.float64]:
+        """Log density [n] of gaps [n, m] under the model with an index, without its weight or quadratic form."""
+        model = replace(self.marginal.models[index], weight=1.0)
+        return replace(self.marginal, models=(model,)).densities(gap)[:, 0]
 
 
 FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")

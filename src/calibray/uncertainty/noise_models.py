@@ -293,8 +293,8 @@ class Marginal:
             elif model.kind == HEAVY:
                 tail = gross() if model.gross else student(model.freedom)
                 value = evidence(gap, design, ridge / self.noise_db, tail)
-            elif model.kind in (CORRELATED, OUT_OF_SIGHT):
-                filter_ = self.whiteners[key := (model.kind, model.range, model.share)]
+            elif (key := (model.kind, model.range, model.share)) in self.whiteners:
+                filter_ = self.whiteners[key]
                 if key not in white:
                     white[key] = filter_.apply(gap.T).T
                 value = _plain(white[key], filter_.apply(design), ridge) - 0.5 * filter_.log_determinant
