@@ -1,11 +1,11 @@
 """Arithmetic of complex numbers stored as pairs of real arrays, and sums over segments.
 
-Compilers vectorize pairs of real arrays, which are therefore several times faster than complex types. All functions of
-pairs work element by element and are differentiable.
+Compilers vectorize operations on pairs of real arrays, so these pairs are several times faster than complex types. All
+functions of pairs work element by element and are differentiable.
 
-A segment consists of the paths of a link, or of a link's interactions with one material. XLA scatters and adds one
-number at a time, which takes about 5 ns each. Most numbers can be added in blocks instead. Numbers are ordered so that
-each block belongs to one segment, and only the remainder of each segment is scattered.
+A segment is either the paths of one link or the interactions of one link with one material. XLA scatters and adds one
+number at a time, which takes about 5 ns per number. Most numbers are therefore added in blocks. The numbers are ordered
+so that each block belongs to one segment, and only the remainder of each segment is scattered.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from jax.typing import ArrayLike
 from numpy.typing import NDArray
 
 Pair = tuple[jax.Array, jax.Array]
-"""A complex number: real and imaginary part."""
+"""A complex number as its real and imaginary parts."""
 
 Values = TypeVar("Values")
 
 _QUARTER: Final = (1.5707963267341256, 6.077100506506192e-11)
 """Pi / 2 as the sum of two numbers (Cody and Waite, Software Manual for the Elementary Functions, 1980, ch. 8). The
-first has 33 bits, so its product with the number of quarter turns is exact for up to a million turns."""
+first number has 33 bits, so its product with the number of quarter turns is exact for up to a million turns."""
 
 _SINE: Final = (
     1.58969099521155010221e-10,
@@ -76,10 +76,10 @@ def safe_sqrt(value: jax.Array) -> jax.Array:
 
 
 def materialize(values: Values, positive: jax.Array) -> Values:
-    """The same values, computed once and stored; `positive` is any positive number that is unknown at compile time.
+    """Return the values, computed once and stored; `positive` is any positive number that is unknown at compile time.
 
-    On the CPU, XLA fuses a computation into each of its uses, so it repeats sines and exponentials many times. It also
-    removes `optimization_barrier`. It cannot fuse across a branch on a value that is unknown at compile time.
+    On the CPU, XLA fuses a computation into each of its uses, so it repeats sines and exponentials many times. XLA also
+    removes `optimization_barrier`. XLA cannot fuse across a branch on a value that is unknown at compile time.
     """
     return jax.lax.cond(
         positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
@@ -91,8 +91,8 @@ def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Cosine and sine of angles [...], [rad].
 
     In double precision, XLA on the CPU calls the system's mathematical functions for one number at a time, which takes
-    about 30 ns for both. Polynomials without branches are vectorized and take 2 ns. Each result is within 2.3e-16 of
-    the true value; beyond a million turns, the rounding error of the angle itself dominates.
+    about 30 ns for a cosine and a sine. Polynomials without branches are vectorized and take 2 ns. Each result is
+    within 2.3e-16 of the true value. Beyond a million turns, the rounding error of the angle itself dominates.
     """
     angle_as_given = jnp.asarray(angle)
     angle = angle_as_given.astype(jnp.float64)
@@ -104,7 +104,7 @@ def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
     sine, cosine = rest * _polynomial(_SINE, square), _polynomial(_COSINE, square)
     quadrant = quarters - 4 * jnp.floor(quarters / 4)  # 0, 1, 2 or 3
     odd = (quadrant == 1) | (quadrant == 3)
-    # An odd number of quarter turns swaps cosine and sine; the cosine is negative in quadrants 1 and 2, the sine in
+    # An odd number of quarter turns swaps cosine and sine. The cosine is negative in quadrants 1 and 2, and the sine in
     # quadrants 2 and 3.
     across, along = jnp.where(odd, sine, cosine), jnp.where(odd, cosine, sine)
     cosine = jnp.where((quadrant == 1) | (quadrant == 2), -across, across)
@@ -120,7 +120,7 @@ def _cosine_and_sine_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def _polynomial(factors: tuple[float, ...], x: jax.Array) -> jax.Array:
-    """Value of a polynomial by Horner's scheme, with coefficients from the highest power down."""
+    """Value of a polynomial by Horner's scheme; the coefficients start at the highest power."""
     value = jnp.full_like(x, factors[0])
     for factor in factors[1:]:
         value = value * x + factor
@@ -150,7 +150,7 @@ class Segments:
 
 
 def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
-    """Prepare sums over segments, from the segment of each number [n] and the number of segments."""
+    """Prepare sums over segments from the segment index of each number [n] and the number of segments."""
     size = np.bincount(segment, minlength=count)
     if not (size >= BLOCK).any():
         return Segments(None, jax.device_put(segment.astype(np.int32)), 0, count)
@@ -167,7 +167,7 @@ def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
 
 
 def segment_sums(segments: Segments, values: jax.Array) -> jax.Array:
-    """Sum of the numbers [n] in every segment [count]; 0 for a segment without numbers."""
+    """Sum of the numbers [n] in each segment [count]; 0 for a segment without numbers."""
     if segments.order is not None:
         end = segments.blocks * BLOCK
         blocks = values.at[segments.order[:end]].get(mode="promise_in_bounds").reshape(-1, BLOCK).sum(axis=1)

@@ -1,8 +1,8 @@
 """Delays, angles and power delay profiles of links, for any materials.
 
 These quantities are computed from the powers of a link's paths, so they depend on the materials as smoothly as path
-loss does. `statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be differentiated
-with respect to the materials, within `calibray.fields.jax_settings`.
+loss does. `statistics` and `delay_profile` are pure JAX. Together with `calibray.fields.path_powers`, they can be
+differentiated with respect to the materials within `calibray.fields.jax_settings`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from calibray.paths import Paths
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ChannelStatistics:
-    """Delay and angle statistics and K-factor of every link; NaN for a link without a path.
+    """Delay statistics, angular spreads and K-factor of every link; NaN for a link without a path.
 
     Attributes:
         mean_delay: Mean delay [L], [s].
@@ -96,14 +96,14 @@ def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: i
 def delay_spread(power: jax.Array, delay: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
     """Root mean square delay spread of every link [L], [s] (ITU-R P.1407-8 eq. 3); NaN without power."""
     mean = link_mean(power, delay, link, num_links)
-    # Delays relative to the mean avoid the cancellation between the mean square and the squared mean.
+    # Using delays relative to the mean avoids cancellation between the mean square and the squared mean.
     excess_delay = delay - jnp.nan_to_num(mean)[link]
     variance = link_mean(power, excess_delay**2, link, num_links)
     return jnp.where(jnp.isfinite(mean), safe_sqrt(variance), jnp.nan)
 
 
 def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Circular spread of angles of every link [L], [rad] (3GPP TR 38.901 annex A.1); NaN without power."""
+    """Circular angular spread of every link [L], [rad] (3GPP TR 38.901 annex A.1); NaN without power."""
     # sqrt(-2 ln |sum P e^{j phi} / sum P|)
     cosine, sine = (link_mean(power, part(angle), link, num_links) for part in (jnp.cos, jnp.sin))
     resultant = jnp.hypot(cosine, sine)
@@ -136,12 +136,12 @@ def power_delay_profile(
         Power gains [L, n]; paths outside all bins are ignored.
 
     Raises:
-        InputError: The edges do not increase, or a material is unknown.
+        InputError: There are fewer than two edges, the edges do not increase, or a material is unknown.
     """
     edges = np.asarray(delays, dtype=float)
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise InputError(
-            f"delays: is an array of shape {edges.shape}, must be two or more increasing bin edges [s]"
+            f"delays: must be two or more increasing bin edges [s], not an array of shape {edges.shape}"
         )
     program = layout(paths).program
     power = path_powers(program, paths.material_table(materials))

@@ -2,8 +2,9 @@
 
 A coefficient depends on the geometry only through the cosine of incidence. If a program has many more interactions than
 its tables have nodes, each candidate's coefficients are computed at the nodes. Interpolation by cubic polynomials
-through four nodes then takes about 10 ns per interaction instead of 100 ns. The position of an interaction in its table
-does not depend on the materials, so it is computed once. Each pair of material and mode has a separate row of nodes.
+through four nodes then takes about 10 ns per interaction, instead of 100 ns for the formula. The position of an
+interaction in its table does not depend on the materials, so it is computed once. Each pair of material and mode has a
+separate row of nodes.
 
 Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
 very close to grazing incidence. A sheet of plasterboard at 2 GHz requires about a hundred intervals, and a thick slab
@@ -52,8 +53,8 @@ _GRAZING: Final = 1e-9
 """Smallest cosine at a node. At exactly 0, even air would be a perfect reflector."""
 
 _EXTRA_NODES: Final = 3
-"""Number of nodes minus number of intervals of a row: one node before the first interval, one at the end of the last
-interval, and one after it."""
+"""Number by which the nodes of a row exceed its intervals: one node before the first interval, one at the end of the
+last interval, and one after the last interval."""
 
 _STENCIL: Final = 3
 """Number of nodes that `table_error` requires on each side of a node."""
@@ -67,7 +68,7 @@ class TableLayout:
     Attributes:
         cell: Index of the node below the coefficient, counted over all rows; one array for each step of each group, [n]
             or [k, n].
-        fraction: Distance from that node in units of the interval, in arrays of the same shapes.
+        fraction: Distance of the coefficient from the node below, in units of the interval; arrays of the same shapes.
         cosine: Cosine of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
@@ -99,7 +100,7 @@ class CoefficientTables:
 
 
 Arguments = tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]
-"""Material, mode and cosine of incidence of coefficients, each [J]."""
+"""Materials, modes and cosines of incidence of the coefficients, each [J]."""
 
 
 def coefficient_arguments(paths: Paths) -> Arguments:
@@ -130,8 +131,8 @@ def table_layout(
 ) -> TableLayout:
     """Find the position of every coefficient [J] in the tables. The degrees `root` [M] come from `spacing_roots`.
 
-    `steps` are the indices of the coefficients at each step of each group, of any shape; the index J marks an empty
-    position, whose coefficient is 1.
+    `steps` contains the indices of the coefficients at each step of each group, in arrays of any shape. The index J
+    marks an empty position, whose coefficient is 1.
     """
     material, mode, cosine = arguments
     rows, row = np.unique(material.astype(np.int64) * len(Mode) + mode, return_inverse=True)
@@ -148,8 +149,8 @@ def table_layout(
     cell = np.append(first[row] + 1 + below, total + 1).astype(np.uint32)
     fraction = np.append(position - below, 0.0).astype(dtype)
     last, material_of_node = cells[row_of_node] + _EXTRA_NODES - 1, (rows // len(Mode))[row_of_node]
-    # The node before grazing incidence has the root -1 / cells, whose even power mirrors the node after it. The last
-    # node lies beyond normal incidence, where the formula continues smoothly.
+    # The node before grazing incidence has the root -1 / cells. Its even power equals that of the node after grazing
+    # incidence. The last node lies beyond normal incidence, where the formula continues smoothly.
     node_cosine = ((rank - 1) / cells[row_of_node]) ** root[material_of_node]
     return TableLayout(
         cell=tuple(jax.device_put(cell[step]) for step in steps),
@@ -163,7 +164,7 @@ def table_layout(
 
 
 def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) -> CoefficientTables:
-    """Compute the coefficients at all nodes for material constants [M, 8] and a wavelength [m]."""
+    """Compute the coefficients at all nodes, given material constants [M, 8] and a wavelength [m]."""
     te, tm = coefficients_of_materials(
         layout.cosine,
         table,
@@ -178,9 +179,9 @@ def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) ->
 
 
 def _cubics(value: jax.Array) -> jax.Array:
-    """Coefficients [N, 16] of the cubics from every node to the next: Lagrange interpolation with both neighbours.
+    """Coefficients [N, 16] of the cubics from each node to the next: Lagrange interpolation through four nodes.
 
-    Cubics at nodes without these neighbours are meaningless and are not used.
+    Cubics at nodes that lack a neighbour are meaningless and are not used.
     """
     before, after, beyond = (jnp.roll(value, -step, axis=0) for step in (-1, 1, 2))
     linear = after - before / 3 - value / 2 - beyond / 6
@@ -228,7 +229,7 @@ def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: i
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
     """Number of intervals by material and mode [M, 3] that limits the error of coefficients to `tolerance` [1].
 
-    The numbers are powers of two up to `FINEST`; 0 if no coefficient has this material and mode. `tables` [n, M, 8]
+    Each number is a power of two up to `FINEST`, or 0 if no coefficient has this material and mode. `tables` [n, M, 8]
     contains the constants of representative candidates.
     """
     material, mode, _ = coefficient_arguments(paths)
@@ -273,7 +274,7 @@ def _errors_by_intervals(
         # Coefficients are even functions of the root of the cosine, so the node before the first mirrors the second.
         node = jnp.concatenate([node[1:2], node])
         interpolated = 9 / 16 * (node[1:-2] + node[2:-1]) - 1 / 16 * (node[:-3] + node[3:])
-        # Nodes end at normal incidence here, so the last interval lacks a neighbour and is omitted.
+        # The nodes end at normal incidence here, so the last interval lacks a neighbouring node and is omitted.
         errors.append(jnp.abs(middle[:-1] - interpolated).max())
         step //= 2
     return jnp.stack(errors)

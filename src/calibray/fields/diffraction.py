@@ -1,8 +1,8 @@
-"""First-order diffraction at wedges: the part of the uniform theory (UTD) that does not depend on the materials.
+"""First-order diffraction at wedges: the part of the uniform theory (UTD) that is independent of the materials.
 
 The Jones matrix of a diffracted ray is affine in the reflection coefficients of the wedge's two faces,
-J = C_0 + R_te(0) C_1 + R_tm(0) C_2 + R_te(n) C_3 + R_tm(n) C_4, with constant matrices C_k. It therefore has the form
-of a reflection with four coefficients instead of two.
+J = C_0 + R_te(0) C_1 + R_tm(0) C_2 + R_te(n) C_3 + R_tm(n) C_4, with constant matrices C_k. A diffraction therefore has
+the form of a reflection with four coefficients instead of two.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
 
     def term(sign: int, beta: NDArray[np.float64]) -> NDArray[np.complex128]:
         """One of the four terms D_i (Kouyoumjian and Pathak 1974, eq. 25; ITU-R P.526-15 eqs. 66-69)."""
-        # a(beta) = 2 cos^2((2 n pi N - beta) / 2), where N is the integer that best meets 2 pi n N - beta = +-pi
+        # a(beta) = 2 cos^2((2 n pi N - beta) / 2), where N is the integer that best satisfies 2 pi n N - beta = +-pi
         turns = np.round((beta + sign * np.pi) / (2 * exterior))
         a = 2 * np.cos(exterior * turns - beta / 2) ** 2
         return scale * _cotangent_times_transition((np.pi + sign * beta) / (2 * n), size * a, n, size)
 
-    # D_1 - D_4 and D_2 - D_3 as in Sionna RT, whose terms of the 0-face have the wrong sign
+    # D_1 - D_4 and D_2 - D_3 as in Sionna RT, where the terms of the 0-face have the wrong sign
     # (docs/explanation/fidelity.md).
     zero_face = term(1, difference) - term(-1, total)
     n_face = term(-1, difference) - term(1, total)
@@ -60,7 +60,7 @@ def transition(x: NDArray[np.float64]) -> NDArray[np.complex128]:
 def _cotangent_times_transition(
     psi: NDArray[np.float64], x: NDArray[np.float64], n: NDArray[np.float64], size: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
-    """cot(psi) F(x), or its finite limit on shadow and reflection boundaries, where a pole meets a zero of F."""
+    """cot(psi) F(x), or its finite limit on shadow and reflection boundaries, where F is 0 at the pole of cot."""
     sine = np.sin(psi)
     pole = np.abs(sine) < 1e-9
     limit = np.where(sine >= 0, 1.0, -1.0) * n * np.sqrt(2 * np.pi * size) * np.exp(0.25j * np.pi)
@@ -68,6 +68,6 @@ def _cotangent_times_transition(
 
 
 def _matrix(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(cos, sin) as the matrix that rotates a Jones vector's frame [2, 2, n]."""
+    """Matrix that rotates a Jones vector's frame [2, 2, n], from (cos, sin)."""
     cos, sin = rotation.T
     return np.array([[cos, sin], [-sin, cos]])

@@ -1,4 +1,4 @@
-"""Effects that are not properties of a material; they change the antenna fields of a program's paths.
+"""Effects that are not material properties and that change the antenna fields of a program's paths.
 
 An effect has its own parameters. All quantities that depend on the fields (path loss, delay spread, derivatives with
 respect to the materials) are evaluated on the changed program.
@@ -26,7 +26,7 @@ class Effect(Protocol):
         ...
 
     def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
-        """The program with changed antenna fields, for the values of all effect parameters [e]."""
+        """The program with its antenna fields changed according to the values of all effect parameters [e]."""
         ...
 
 
@@ -63,14 +63,14 @@ def with_antenna_fields(program: GroupedProgram, fields: list[AntennaFields]) ->
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ExtraLoss:
-    """Loss of paths through regions such as woodland; it saturates with the length of the path inside the regions.
+    """Loss on paths through regions such as woodland; the loss saturates with the path length inside the regions.
 
     Attributes:
         length: Length of every path inside the regions, times the ratio of the specific attenuation at the paths'
             carrier to that at the study's carrier [P], [m].
         maximum_db: Limit that the loss approaches for long paths in the regions [dB].
         index: Index of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
-        fixed: The specific attenuation if it is fixed [dB/m].
+        fixed: Specific attenuation [dB/m], if it is fixed.
     """
 
     length: jax.Array | NDArray[np.float64]
@@ -94,7 +94,7 @@ class ExtraLoss:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class RoughSurfaces:
-    """Loss of specular reflections on M rough materials: Rayleigh's roughness factor.
+    """Loss in specular reflections from M rough materials: the Rayleigh roughness factor.
 
     Attributes:
         exponent: 8 (pi / lambda)^2 times the sum of cos^2 theta over the specular reflections of each path on each
@@ -120,21 +120,23 @@ class RoughSurfaces:
             ]
         )
         # Mean reflected field for heights of standard deviation s: exp(-8 (pi s cos theta / lambda)^2), W. S. Ament,
-        # Proc. IRE 41(1), 1953; its square is the share of the power that stays in the specular direction.
+        # Proc. IRE 41(1), 1953. The square of this factor is the share of the power that stays in the specular
+        # direction.
         return scaled(program, jnp.exp(-jnp.asarray(self.exponent) @ heights**2))
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class DisplacementLoss:
-    """Change of path loss due to displacements of G groups of links along K axes, as cubics between N knots.
+    """Change in path loss when G groups of links are displaced along K axes, interpolated by cubics between N knots.
 
     Attributes:
         link: Link of every path [P].
         group: Group of every link [K, L].
-        weights: Displacement of every group per unit of each effect parameter; for each axis an array [G, e], [m].
+        weights: Displacement of every group per unit of each effect parameter; one array [G, e] for each axis, [m].
         origin: Values of the effect parameters at which the paths were traced [e].
-        knots: Traced displacements of every link, ascending [K, N, L], [m]; beyond them the change is constant.
+        knots: Displacements at which every link was traced, ascending [K, N, L], [m]; beyond the outer knots, the
+            change is constant.
         coefficients: Coefficients of the cubics in the distance from the lower knot, highest power first
             [K, 4, N - 1, L].
     """
@@ -154,10 +156,10 @@ class DisplacementLoss:
     def error_db(self) -> NDArray[np.float64]:
         """Interpolation error between the five middle knots, for all axes [L], [dB]; 0 for fewer than seven knots.
 
-        At each of the three inner knots, the change is compared with the straight line between the two neighbours. The
-        RMS differences of the axes add in quadrature. For a step of J dB next to the middle knot, the result is J /
-        sqrt(6), the RMS error of linear interpolation across a step at any position. For a step in an outer interval,
-        the result is J / sqrt(12).
+        At each of the three inner knots, the change is compared with the straight line between the two neighbouring
+        knots. The RMS differences of the axes add in quadrature. For a step of J dB next to the middle knot, the result
+        is J / sqrt(6), the RMS error of linear interpolation across a step at any position. For a step in an outer
+        interval, the result is J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:

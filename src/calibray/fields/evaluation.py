@@ -5,9 +5,9 @@ therefore stay in the core's L1 cache, and a smaller batch takes proportionally 
 are materialized (`calibray.fields.arithmetic.materialize`). Otherwise, XLA on the CPU would fuse each stage into all of
 its uses and repeat it there.
 
-Large programs with tables are evaluated in stages that are compiled separately. A single stage interpolates
-coefficients, propagates the fields and computes the power, so it reads every constant once and writes one number per
-path.
+Large programs with tables are evaluated in stages that are compiled separately. One stage interpolates the
+coefficients, propagates the fields and computes the power. This stage therefore reads every constant once and writes
+one number per path.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from calibray.materials import Material
 from calibray.paths import Paths
 
 WITHOUT_TABLES: Final = np.zeros((1, 1, 3))
-"""Interpolation errors of coefficients if no tables are used; the array broadcasts over candidates and materials."""
+"""Interpolation errors of coefficients without tables: all 0. The array broadcasts over candidates and materials."""
 
 
 @jax_settings()
@@ -61,7 +61,7 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
         materials: Material constants by name; the other materials keep the constants of the trace.
 
     Returns:
-        Complex gains [P]; [P, R, T] if an antenna is dual-polarized.
+        Complex gains [P], or [P, R, T] if an antenna is dual-polarized.
 
     Raises:
         InputError: A material is unknown.
@@ -84,8 +84,8 @@ def path_loss(
     Args:
         paths: The path program.
         materials: Material constants by name; the other materials keep the constants of the trace.
-        combining: "power" sums the paths' powers (for a wide band, or many snapshots), "coherent" sums their fields at
-            the carrier, and "band" averages the coherent power over `bandwidth`.
+        combining: "power" sums the paths' powers (for a wide band, or an average over many snapshots), "coherent" sums
+            their fields at the carrier, and "band" averages the coherent power over `bandwidth`.
         bandwidth: Bandwidth [Hz], for "band".
 
     Returns:
@@ -101,7 +101,7 @@ def path_loss(
 
 @jax_settings()
 def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Combining = POWER) -> jax.Array:
-    """Path loss of every link [L], [dB], for material constants [M, 8], as one pure function.
+    """Path loss of every link [L], [dB], for material constants [M, 8], as a pure function.
 
     Path loss is +inf for a link without a path. Differentiate or compile the function within
     `calibray.fields.jax_settings`.
@@ -112,7 +112,7 @@ def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Comb
 
 @jax_settings()
 def program_gains(program: GroupedProgram, table: jax.Array) -> Pair:
-    """Gains of all paths in the order of the program, real and imaginary part [R, T, P], as one pure function.
+    """Gains of all paths in the program's order, real and imaginary parts [R, T, P], as a pure function.
 
     `table` contains the material constants [M, 8].
     """
@@ -140,12 +140,12 @@ def path_losses(
 
     Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
     candidate, material and mode [count, M, 3]; it is zero without tables. Only the first `count` candidates are
-    evaluated. The function is compiled for a batch of n, so a partly filled batch needs no new compilation.
+    evaluated. The function is compiled for batches of n candidates, so a partly filled batch needs no new compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
         return np.asarray(_losses(program, tables, None, count, combining))[:count], WITHOUT_TABLES
-    # Looking up coefficients where they are used is fastest if each is used only once.
+    # If each coefficient is used only once, it is fastest to look it up where it is used.
     single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
     for table in tables[:count]:
@@ -189,7 +189,7 @@ def path_losses_and_slopes(
 
 
 def _stacked_losses(powers: Sequence[ArrayLike], size: int) -> NDArray[np.floating]:
-    """Path loss [n, L], [dB], from the powers of n candidates; compiled for `size` candidates."""
+    """Path loss [n, L], [dB], from the powers of n candidates; the conversion is compiled for `size` candidates."""
     stacked = np.stack(powers)
     padded = np.zeros((size, stacked.shape[1]), stacked.dtype)
     padded[: len(stacked)] = stacked
@@ -220,7 +220,7 @@ def path_losses_and_slopes_with_effects(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss with effects, and its derivatives.
 
-    The derivatives are with respect to constants [count, L, M, columns] and to effect parameters [count, L, e].
+    The derivatives are with respect to constants [count, L, M, columns] and effect parameters [count, L, e].
     """
     count = len(tables) if count is None else count
     answers = _slopes_with_effects(program, tables, effects, count, columns, combining)
@@ -231,7 +231,7 @@ def path_losses_and_slopes_with_effects(
 def _power(
     program: GroupedProgram, responses: tuple[GroupResponse, ...], combining: Combining, keep: bool = False
 ) -> jax.Array:
-    """Power gain of every link [L]; `keep` stores the field after every interaction for a reverse pass."""
+    """Power gain of every link [L]; with `keep`, the field after every interaction is stored for a reverse pass."""
     stored = partial(materialize, positive=program.wavelength)
     gain = path_fields(program, responses, stored if keep else lambda field: field)
     if combining.kind == "power":
@@ -263,8 +263,8 @@ def contract(
 
     Every interaction belongs to one material, so one tangent per column yields the derivatives for all materials. The
     computing time therefore does not grow with the number of materials. `slope` contains the derivatives of the
-    quantity with respect to the response at every step. `derivatives` contains those of the response with respect to
-    the constants in each column.
+    quantity with respect to the response at every step. `derivatives` contains the derivatives of the response with
+    respect to the constants in each column.
     """
     if not derivatives:
         return jnp.zeros((program.num_links, num_materials, 0), program.wavelength.dtype)
@@ -303,11 +303,11 @@ def _loss_slope(power: jax.Array) -> jax.Array:
 def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields], blank: jax.Array) -> jax.Array:
     """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields.
 
-    `blank` is the result without paths [0, e].
+    `blank` is the empty result [0, e] of a program without paths.
     """
     groups = [blank]
     for outer, inner in zip(by_field, tangents, strict=True):
-        # Fields are [2 or 1, ports, 2, n], their tangents [..., n, e].
+        # Fields have the shape [2 or 1, ports, 2, n], and their tangents the shape [..., n, e].
         products = (jnp.einsum("abcn,abcne->ne", a, b) for a, b in zip(outer, inner, strict=True))
         groups.append(reduce(add, products))
     return jnp.concatenate(groups)
@@ -319,7 +319,7 @@ def _dot(a: object, b: object) -> jax.Array:
 
 
 _decibel = jax.jit(decibel)
-# Traced once for all sizes of a batch.
+# JAX traces this function once for all batch sizes.
 _path_loss = jax.jit(program_path_loss, inline=True)
 _material_response = jax.jit(material_response)
 # The functions that `path_powers` calls have no compiler options: a user may compile them as part of another function.
@@ -406,7 +406,8 @@ def _slopes_with_effects(
     stored, values = partial(materialize, positive=program.wavelength), effects.values
 
     def evaluate(index: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        # Effects change only the antenna fields, so their tangents are combined with the power's gradient there.
+        # Effects change only the antenna fields. The tangents of these fields are therefore combined with the
+        # derivatives of the power with respect to the fields.
         fields, push = jax.linearize(
             lambda value: antenna_fields(apply_effects(program, effects.effects, value)), values[index]
         )

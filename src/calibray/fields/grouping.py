@@ -1,8 +1,8 @@
 """Groups of paths that are evaluated together, and the sequence of their interactions.
 
-Paths of a group have interactions of the same kinds in the same order, so every step of a group is a dense array. With
-padding, paths that differ only in the lengths of their runs of reflections and transmissions belong to the same group.
-Shorter runs are padded with interactions that have no effect.
+The paths of a group have interactions of the same kinds in the same order, so every step of a group is a dense array.
+With padding, paths that differ only in the lengths of their runs of reflections and transmissions belong to the same
+group. Shorter runs are padded with interactions that have no effect.
 """
 
 from __future__ import annotations
@@ -59,19 +59,20 @@ def exact_groups(paths: Paths) -> list[PathGroup]:
 def padded_groups(paths: Paths) -> list[PathGroup]:
     """Group paths whose sequences are equal if each run of reflections and transmissions counts as one interaction.
 
-    Within a group, the path with the most reflections and transmissions comes first; each run is as long as the longest
-    corresponding run in the group.
+    Within a group, the path with the most reflections and transmissions comes first. Each run is padded to the length
+    of the longest corresponding run in the group.
     """
     number, interaction = _numbers(paths), np.arange(paths.num_interactions)
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     is_coefficient = number == _COEFFICIENT_NUMBER
-    # Index of the run that an interaction belongs to or ends: the number of other interactions before it on its path.
+    # Index of the run that an interaction belongs to or ends: the number of earlier diffuse reflections and
+    # diffractions on its path.
     others_before = np.concatenate([[0], np.cumsum(~is_coefficient)])
     run = others_before[:-1] - others_before[paths.first[path]]
     last_other = np.maximum.accumulate(np.where(is_coefficient, -1, interaction))
     rank = interaction - np.maximum(last_other + 1, paths.first[path])  # within its run
     count = np.bincount(path, is_coefficient, paths.num_paths)
-    # Paths with fewer of these interactions come last, so that most empty positions are at the end of a line.
+    # Paths with fewer reflections and transmissions come last, so that most empty positions are at the end of a line.
     members = [
         group[np.argsort(-count[group], kind="stable")]
         for group in _equal(_sequence_codes(paths, np.where(is_coefficient, 0, number)))
@@ -106,15 +107,15 @@ def _numbers(paths: Paths) -> NDArray[np.int64]:
 
 
 def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One code for each path [P], equal for paths with equal sequences of numbers, in which zeros are skipped."""
+    """Code of each path [P]; paths with the same sequence of nonzero numbers have the same code."""
     depth, code = np.diff(paths.first), np.zeros(paths.num_paths, dtype=np.int64)
     for step in range(int(depth.max(initial=0))):
         deep = np.flatnonzero(depth > step)
         digit = number[paths.first[:-1][deep] + step]
         code[deep] = np.where(digit > 0, code[deep] * 4 + digit, code[deep])
         if step % 16 == 15:
-            # Each step takes two bits: renumber before the code of a long path exceeds 64 bits. The last digit of the
-            # new codes is 0, so that a longer path cannot get the code of a path that ends here.
+            # Each step takes two bits, so codes are renumbered before that of a long path exceeds 64 bits. The last
+            # digit of the new codes is 0, so that a longer path cannot get the code of a path that ends here.
             code = 4 * np.unique(code, return_inverse=True)[1].reshape(-1)
     return code
 

@@ -1,6 +1,6 @@
-"""Calibray's use of JAX: settings, a store of compiled programs, and their compilation.
+"""Calibray's use of JAX: settings, compilation, and a store of compiled programs.
 
-Outside Calibray's calls, the user's settings apply.
+Outside calls to Calibray, the user's settings apply.
 
 Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes. A
 compiled program is machine code, so Calibray reads it only from a folder to which no one but the user can write
@@ -38,8 +38,8 @@ _users_cache: Any = None
 def jax_settings() -> Iterator[None]:
     """Compute in double precision and keep compiled programs; on exit, the user's JAX settings are restored.
 
-    Every numerical function of `calibray.fields` uses these settings. Enter this context yourself to differentiate or
-    compile code around one of the pure functions.
+    Every numerical function of `calibray.fields` uses these settings. Enter this context yourself before you
+    differentiate or compile code that calls one of the pure functions.
 
     Raises:
         InputError: JAX finds no device to compute on.
@@ -54,7 +54,7 @@ def jax_settings() -> Iterator[None]:
     """
     _check_device()
     with jax.enable_x64(True):
-        # A folder is set if the user named one, or within another call to Calibray.
+        # A folder is already set if the user chose one, or within another call to Calibray.
         programs = _kept_programs() if jax.config.values["jax_compilation_cache_dir"] is None else None
         if programs is None:
             yield
@@ -137,7 +137,7 @@ def _kept_programs() -> Any:
 
 
 def _entry_name(key: str) -> str:
-    """Name of an entry; it depends on the processor, because compiled code can crash on a different processor."""
+    """Name of an entry, which depends on the processor because compiled code can crash on a different processor."""
     return hashlib.sha256(f"{key} {_processor()}".encode()).hexdigest()
 
 
@@ -152,20 +152,21 @@ def _processor() -> str:
 
 
 WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
-"""Option to compile for vectors of 512 bits. XLA prefers 256 bits even on processors with wider vectors; on other
-processors the option has no effect. The results are the same."""
+"""Compiler option for vectors of 512 bits. XLA prefers 256 bits even on processors with wider vectors. On other
+processors, the option has no effect. The option does not change results."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}
-"""The same options without XLA's fusion emitters, for faster compilation. The results differ by rounding errors."""
+"""The same options without XLA's fusion emitters, for faster compilation. Results with and without the emitters differ
+by rounding errors."""
 
 
 def compiled(
     function: Callable[..., Any] | None = None, *, static_argnums: int | tuple[int, ...] = ()
 ) -> Callable[..., Any]:
-    """Compile a function as `jax.jit` does; its first argument is a program or has an attribute `program`.
+    """Compile a function as `jax.jit` does; its first argument must be a program or have an attribute `program`.
 
-    The function is compiled anew for each value of the arguments at the positions `static_argnums`. Without a function,
-    the result is a decorator.
+    The function is compiled anew for each value of the arguments at the positions `static_argnums`. If no function is
+    given, `compiled` returns a decorator.
     """
     if function is None:
         return lambda function: compiled(function, static_argnums=static_argnums)

@@ -27,19 +27,20 @@ from calibray.fields.program import DiffuseArguments, FormulaArguments, GroupedP
 from calibray.fields.slab import FIELD_COLUMN, coefficients_of_materials, loss_term
 
 Coefficients = tuple[Pair, Pair]
-"""Transverse electric and transverse magnetic coefficient."""
+"""Transverse electric and transverse magnetic coefficients."""
 
 GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array], ...]]
-"""The coefficients at every step of a group (a diffraction has two), and two amplitudes at every diffuse reflection."""
+"""The coefficients at every step of a group (two at a diffraction), and two amplitudes at every diffuse reflection."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MaterialResponse:
-    """The quantities of all interactions that depend on the materials.
+    """The material-dependent quantities of all interactions.
 
     Attributes:
-        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
+        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K], or the tables of these
+            coefficients.
         co_polarized: Amplitude S sqrt(f_s dOmega (1 - K_x)) of each diffuse interaction in the original polarization
             [D].
         cross_polarized: Amplitude S sqrt(f_s dOmega K_x) in the orthogonal polarization [D].
@@ -97,7 +98,7 @@ def response_and_derivatives(
 
 
 def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse) -> MaterialResponse:
-    """Derivatives with respect to the conductivity from those with respect to the permittivity, which saves a pass.
+    """Derivatives with respect to conductivity, computed from those with respect to permittivity to save a pass.
 
     Coefficients are analytic in eta = eps_r - j loss, and the loss is proportional to the conductivity. The derivative
     with respect to the conductivity is therefore -j times the loss per unit of conductivity times the derivative with
@@ -132,7 +133,7 @@ def split_by_step(
     for group in program.groups:
         coefficients, amplitudes = [], []
         for letter in group.signature:
-            # A diffraction takes the coefficients of both faces of the wedge.
+            # A diffraction uses the coefficients of both faces of the wedge.
             coefficients += [next(step_coefficients) for _ in range(2 if letter == DIFFRACTION else 1)]
             if letter == SCATTERING:
                 rows = slice(row, row + group.size)
@@ -166,7 +167,7 @@ def _unpacked(
 ) -> jax.Array:
     """The coefficients of one step of a group, with `blank` at positions that are not stored.
 
-    Each line is read past its end, and the excess is replaced, so no separate pass is necessary.
+    Each line is read past its end, and the excess is replaced by `blank`, so no separate pass is necessary.
     """
     parts, size = [], shape[-1]
     for length in reversed(lines):  # the last line is stored first
@@ -178,7 +179,7 @@ def _unpacked(
 
 
 LARGEST_EXPONENT = 64
-"""Largest exponent alpha for which the normalization is a sum; above it, a Gaussian lobe is accurate to 0.0021 dB."""
+"""Largest exponent alpha for which the normalization is a sum. Above it, a Gaussian lobe is accurate to 0.0021 dB."""
 
 
 def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:

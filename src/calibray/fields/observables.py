@@ -1,11 +1,11 @@
-"""Observables other than path loss, as a receiver measures them, with derivatives.
+"""Observables other than path loss, modelled as a receiver measures them, with derivatives.
 
-Each observable is a power-weighted statistic of the paths that a receiver resolves in a link. A receiver of limited
-bandwidth resolves taps instead of paths. Taps are samples of its power delay profile, in which the pulse of each path
-is spread over a few taps. The receiver does not detect taps far below the strongest tap or below its noise floor. A
-logistic function of the level in dB, `SOFT_DB` wide, replaces each of these hard limits, so derivatives are exact. The
-function changes the weight of taps within about 2 dB of a limit. `docs/measurements/observables.md` shows the error of
-the smooth limit.
+Each observable is a power-weighted statistic of the paths that a receiver resolves on a link. A receiver of limited
+bandwidth resolves taps instead of paths. Taps are samples of the power delay profile, in which the pulse of each path
+is spread over a few taps. The receiver does not detect taps that are far below the strongest tap or below the noise
+floor. Each of these hard limits is replaced by a logistic function of the level in dB, with scale `SOFT_DB`, so that
+derivatives are exact. The logistic function changes the weight of taps within about 2 dB of a limit.
+`docs/measurements/observables.md` shows the error of the smooth limit.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ contain 0.05 % of the power, and the highest is 31 dB below the main lobe."""
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Taps:
-    """The T taps of all links into which a receiver of limited bandwidth resolves P paths.
+    """The T taps of all links; a receiver of limited bandwidth resolves the P paths into these taps.
 
     Attributes:
         delay: Delay of every tap [T], [s].
@@ -56,7 +56,7 @@ class Taps:
 
     @classmethod
     def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
-        """The taps of paths with delays [P], [s], in links [P], at a bandwidth [Hz].
+        """The taps of paths, given their delays [P], [s], their links [P] and the bandwidth [Hz].
 
         Taps are 1 / bandwidth apart. At this spacing, sampling preserves the power, mean delay and mean square delay of
         the profile, regardless of the position of a path between two taps.
@@ -77,7 +77,7 @@ class Taps:
         )
 
     def power(self, power: jax.Array) -> jax.Array:
-        """Power of every tap [T] from that of every path [P]."""
+        """Power of every tap [T] from the power of every path [P]."""
         spread = power[:, None] * self.share
         return jax.ops.segment_sum(spread.ravel(), jnp.asarray(self.index).ravel(), len(self.delay))
 
@@ -107,8 +107,8 @@ class Channel:
         effects: Effects on the paths.
         base: Constants of the materials before calibration [M, 8].
         departure: Zenith and azimuth of departure of every path [P, 2], [rad].
-        arrival: Zenith and azimuth of arrival, in the same form.
-        taps: The taps for each bandwidth among the statistics.
+        arrival: Zenith and azimuth of arrival of every path [P, 2], [rad].
+        taps: The taps for each bandwidth that the statistics use.
         cells: For every material parameter: its index, and the row and column of its constant in `base`.
         of_effects: Indices of the parameters of effects.
         wanted: The K statistics to compute.
@@ -240,7 +240,7 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
     angle = jnp.asarray(_angles(channel, wanted.kind))
     if wanted.kind in kinds.SECTORS:
         start, _ = wanted.bin
-        # Angles are measured from the start of the sector, which may contain the jump from pi to -pi.
+        # Angles are measured from the start of the sector, because the sector may contain the jump from pi to -pi.
         turned = (angle - start) % (2 * np.pi) + start
         return _share(path_weight, turned, link, num_links, wanted)
     return angular_spread(path_weight, angle, link, num_links)
@@ -267,14 +267,15 @@ def _share(
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
-    # The added term is the power that lies below the dynamic range; it keeps the level of an empty bin finite.
+    # The added term is the power at the lower end of the dynamic range. This term keeps the level of an empty bin
+    # finite.
     return 10 * jnp.log10(share + 10 ** (-range_db / 10))
 
 
 def _flight(
     weight: jax.Array, seen: jax.Array, delay: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Time of flight of every link [L], [s]: mean over all paths, or over one path and those not resolved from it."""
+    """Time of flight of every link [L], [s]: mean over all paths, or over one path and paths not resolved from it."""
     if wanted.path == "mean":
         return link_mean(weight, delay, link, num_links)
     if wanted.path == "first":
@@ -284,7 +285,8 @@ def _flight(
     start = jax.ops.segment_min(jnp.where(chosen, delay, jnp.inf), link, num_links)
     if wanted.bandwidth is None:
         return jnp.where(jnp.isfinite(start), start, jnp.nan)
-    # A path within 1 / bandwidth of the chosen one is not resolved from it; its weight falls as a raised cosine.
+    # A path within 1 / bandwidth of the chosen path is not resolved from it. The weight of this path decreases as a
+    # raised cosine.
     apart = (delay - start[link]) * wanted.bandwidth
     unresolved = jnp.where(jnp.abs(apart) < 1.0, 0.5 * (1 + jnp.cos(jnp.pi * apart)), 0.0)
     return link_mean(weight * unresolved, delay, link, num_links)

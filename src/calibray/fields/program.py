@@ -48,7 +48,8 @@ class Group:
     """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
 
     Attributes:
-        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part if all are real [1, T, 2, n].
+        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part [1, T, 2, n] if all fields are
+            real.
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: For each step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of
             k.
@@ -81,7 +82,7 @@ class FormulaArguments:
         material: Material [K].
         cosine: Cosine of the angle of incidence [K].
         transmitted: Whether the coefficient is a transmission coefficient [K].
-        unreduced: Whether the coefficient is a reflection coefficient not reduced by scattering, as in a diffuse
+        unreduced: Whether the coefficient is a reflection coefficient that scattering does not reduce, as in a diffuse
             interaction [K].
         blank: Whether the position is empty and its coefficient is 1 [K]; None if no position is empty.
         shapes: Shape of the positions at each step of each group, (n,) or (k, n).
@@ -110,9 +111,10 @@ class DiffuseArguments:
         solid_angle: Solid angle of the ray tube, divided by its sampling probability [D], [sr].
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
-        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty in the same case.
-        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty in
-            the same case.
+        cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty if every material is
+            Lambertian.
+        cos_backward: Cosine of the angle between the scattered direction and the direction to the source [D]; empty if
+            every material is Lambertian.
         patterns: Scattering pattern of every material.
     """
 
@@ -193,9 +195,9 @@ def layout(
 ) -> Layout:
     """Lay out a path program for evaluation in a given precision on JAX's default device.
 
-    With `intervals`, one number or one for each material and mode [M, 3], the coefficients are tabulated by angle of
-    incidence. Without `intervals`, the slab formula is evaluated at every interaction. With `phases`, the links and
-    delays of the paths are stored. Without `phases`, only sums of powers can be computed.
+    If `intervals` is given (one number, or one for each material and mode [M, 3]), the coefficients are tabulated by
+    angle of incidence. Without `intervals`, the slab formula is evaluated at every interaction. With `phases`, the
+    links and delays of the paths are stored. Without `phases`, only sums of powers can be computed.
     """
     # Use jax.device_put: jnp.asarray compiles a program for every shape, which takes 15 ms.
     padded = intervals is None or paths.num_interactions <= LARGE
@@ -205,7 +207,7 @@ def layout(
     num_materials = len(paths.materials)
     link = np.repeat(paths.link, np.diff(paths.first)).astype(np.int64)
     segment = link * num_materials + paths.material
-    # Padding belongs to segment 0. It adds nothing there, because its derivatives are 0.
+    # Padding belongs to segment 0. Padding adds nothing there, because its derivatives are 0.
     segment_of_coefficient = np.concatenate([segment, segment[numbering.wedges], [0]])
     num_segments = paths.num_links * num_materials
     program = GroupedProgram(
@@ -233,9 +235,9 @@ class _Numbering:
 
     Attributes:
         wedges: Interaction indices of the diffractions [W].
-        count: Number of coefficients; as an index, it marks an empty position.
+        count: Number of coefficients; used as an index, this number marks an empty position.
         table_row: Row of each interaction in the table of its kind, -1 for reflections and transmissions [I].
-        steps: Coefficients at each step of each group, [n] or [k, n]; a diffraction has two steps.
+        steps: Indices of the coefficients at each step of each group, [n] or [k, n]; a diffraction has two steps.
         scattered: Indices of the diffuse interactions in the order of use [D].
     """
 
@@ -299,7 +301,7 @@ def _diffuse(
 ) -> DiffuseArguments:
     table = paths.diffuse
     patterns = tuple(material.scattering_pattern for material in paths.materials.values())
-    # A Lambertian pattern depends on none of these angles.
+    # A Lambertian pattern does not depend on the angles that `lobes` selects.
     lobes = slice(0 if all(pattern == "lambertian" for pattern in patterns) else None)
 
     def column(values: NDArray[np.float64]) -> jax.Array:
@@ -351,5 +353,5 @@ def _num_parts(field: NDArray[np.complex128]) -> int:
 
 
 def _parts(value: NDArray[np.complex128], dtype: type, count: int = 2) -> jax.Array:
-    """Real and imaginary part, or only the real part."""
+    """Real and imaginary parts, or only the real part."""
     return jax.device_put(np.stack([value.real, value.imag][:count]).astype(dtype))

@@ -34,7 +34,7 @@ class Keep(Protocol):
 def path_fields(
     program: GroupedProgram, responses: tuple[GroupResponse, ...], keep: Keep = lambda values: values
 ) -> Pair:
-    """Gains of all paths in the order of the groups, real and imaginary part [R, T, P].
+    """Gains of all paths in the order of the groups, real and imaginary parts [R, T, P].
 
     `keep` is applied to the field after every interaction.
     """
@@ -49,7 +49,7 @@ def path_fields(
 
 
 def _group_gains(group: Group, response: GroupResponse, keep: Keep) -> Pair:
-    """Gains of one group's paths, real and imaginary part [R, T, n].
+    """Gains of one group's paths, real and imaginary parts [R, T, n].
 
     The gain of a path is a = (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx; the factor (lambda / 4 pi) A is part of `rx`.
     """
@@ -164,7 +164,7 @@ class Combining:
     ) -> Combining:
         """Check and prepare a method of combining paths: "power", "coherent", or "band" with a bandwidth [Hz].
 
-        `link` [P] must be non-decreasing; `delay` is [P], [s].
+        `link` [P] must be non-decreasing. `delay` [P] is in seconds.
 
         Raises:
             InputError: The kind is unknown, or the bandwidth is missing or not positive.
@@ -175,7 +175,7 @@ class Combining:
 
 
 POWER: Final = Combining()
-"""Combining by the sum of powers."""
+"""Combining of paths by the sum of their powers."""
 
 
 def _band_nodes(
@@ -184,14 +184,14 @@ def _band_nodes(
     """Gauss-Legendre nodes and weights over a band [2, q], with enough nodes for the largest delay span in any link.
 
     The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A quadrature rule with n
-    nodes integrates them to machine precision if n exceeds about ten plus a quarter of their phase change over the
-    band.
+    nodes integrates these oscillations to machine precision if n exceeds about ten plus a quarter of their phase change
+    over the band.
 
     Raises:
         InputError: The bandwidth is not positive.
     """
     if bandwidth is None or not (np.isfinite(bandwidth) and bandwidth > 0):
-        raise InputError(f'combining = "band": bandwidth = {bandwidth}, must be a positive number of Hz')
+        raise InputError(f'combining = "band": the bandwidth [Hz] must be a positive number, not {bandwidth}')
     spread = 0.0
     if len(link):
         start = np.flatnonzero(np.diff(link, prepend=-1))
@@ -203,7 +203,7 @@ def _band_nodes(
 def path_power(gain: Pair) -> jax.Array:
     """Power gain of every path [P], summed over receive ports and averaged over transmit ports.
 
-    Path gains are [R, T, P], real and imaginary part.
+    Path gains are given as real and imaginary parts [R, T, P].
     """
     return squared_magnitude(gain).sum(axis=(0, 1)) / gain[0].shape[1]
 
@@ -233,7 +233,7 @@ def link_power(
 
 
 def decibel(power: jax.Array) -> jax.Array:
-    """Path loss -10 log10(power) from power gains [dB]; +inf where the power is 0."""
+    """Path loss -10 log10(power) [dB] from power gains; +inf where the power is 0."""
     reached = power > 0
     return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
 

@@ -44,11 +44,11 @@ def coefficients(
     wavelength: jax.Array,
     transmitted: jax.Array | bool,
 ) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic reflection coefficients; transmission coefficients where `transmitted` is true.
+    """Transverse electric and magnetic coefficients of reflection, or of transmission where `transmitted` is true.
 
     The permittivity is relative, `loss` comes from `loss_term`, and thickness and wavelength are in metres. Each
-    coefficient is (real, imaginary) [...], in the precision of the cosine. Coefficients are computed in double
-    precision, because the fourth power of a metal's permittivity exceeds the range of single precision.
+    coefficient is a pair (real, imaginary) [...] in the precision of the cosine. Internally, coefficients are computed
+    in double precision, because the fourth power of a metal's permittivity exceeds the range of single precision.
     """
     precision = cosine.dtype
     cosine, permittivity, loss, thickness, wavelength = (
@@ -88,7 +88,7 @@ def coefficients_of_materials(
 ) -> tuple[Pair, Pair]:
     """Coefficients [...] from material constants [M, 8].
 
-    The scattered energy reduces reflection coefficients, except where `unreduced` [...] is true.
+    Scattering reduces the reflection coefficients, except where `unreduced` [...] is true.
     """
     column = {name: table[:, index] for name, index in FIELD_COLUMN.items()}
     te, tm = coefficients(
