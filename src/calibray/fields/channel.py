@@ -33,7 +33,8 @@ class ChannelStatistics:
     Attributes:
         mean_delay: Mean delay [L], [s].
         delay_spread: Root mean square delay spread [L], [s].
-        k_factor_db: Ratio of the strongest path's power to that of all other paths [L], [dB]; +inf for a single path.
+        k_factor_db: Ratio of the strongest path's power to the total power of all other paths [L], [dB]; +inf for a
+            single path.
         departure_spread: Azimuth spread at departure [L], [rad].
         arrival_spread: Azimuth spread at arrival [L], [rad].
     """
@@ -113,7 +114,7 @@ def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_link
 
 
 def k_factor_db(power: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Ratio of the strongest path's power to that of all other paths of a link [L], [dB]; NaN without power."""
+    """Ratio of the strongest path's power to the power of all other paths [L], [dB]; NaN for links without power."""
     total = jax.ops.segment_sum(power, link, num_links)
     strongest = jax.ops.segment_max(power, link, num_links)
     rest = total - strongest

@@ -69,7 +69,7 @@ class ExtraLoss:
         length: Length of every path inside the regions, times the ratio of the specific attenuation at the paths'
             carrier to that at the study's carrier [P], [m].
         maximum_db: Limit that the loss approaches for long paths in the regions [dB].
-        index: Index of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
+        index: Index of the parameter that is the specific attenuation [dB/m]; None if the attenuation is fixed.
         fixed: Specific attenuation [dB/m], if it is fixed.
     """
 
@@ -100,7 +100,8 @@ class RoughSurfaces:
         exponent: 8 (pi / lambda)^2 times the sum of cos^2 theta over the specular reflections of each path on each
             material [P, M], [1/mm^2].
         fixed: Standard deviation of the surface height of each material [M], [mm], if it is fixed.
-        index: For each material, the index of the parameter that is this standard deviation; None if it is fixed.
+        index: For each material, the index of the parameter that is the standard deviation; None if the deviation is
+            fixed.
     """
 
     exponent: jax.Array | NDArray[np.float64]

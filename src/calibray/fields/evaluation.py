@@ -322,7 +322,8 @@ _decibel = jax.jit(decibel)
 # JAX traces this function once for all batch sizes.
 _path_loss = jax.jit(program_path_loss, inline=True)
 _material_response = jax.jit(material_response)
-# The functions that `path_powers` calls have no compiler options: a user may compile them as part of another function.
+# The functions that `path_powers` calls have no compiler options, because a user may compile them as part of another
+# function.
 _split_by_step = jax.jit(split_by_step)
 _split_by_step_wide = jax.jit(split_by_step, compiler_options=WIDE)
 _gains = compiled(program_gains)

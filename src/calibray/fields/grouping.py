@@ -32,8 +32,8 @@ _LETTERS: Final = ("?", COEFFICIENT, SCATTERING, DIFFRACTION)
 _COEFFICIENT_NUMBER: Final = _LETTERS.index(COEFFICIENT)
 
 Step = tuple[str, NDArray[np.int64]]
-"""A letter, and the interactions of a group's n paths: [n], or [k, n] for a run of k, with -1 where a path has no
-interaction."""
+"""The letter of a step, and the interactions of a group's n paths at this step: [n], or [k, n] for a run of k, with -1
+where a path has no interaction."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ Paths are grouped by the kinds of their interactions (`calibray.fields.grouping`
 slab formula is evaluated for all groups at once, so its arguments are stored in flat arrays over all groups.
 
 A large program with tables is stored without padding. In other programs, shorter runs of reflections and transmissions
-are padded, so fewer groups have to be compiled. This saves time, because a small program takes less time to evaluate
-than to compile.
+are padded, so fewer groups have to be compiled. Padding saves time there, because a small program takes less time to
+evaluate than to compile.
 """
 
 from __future__ import annotations
