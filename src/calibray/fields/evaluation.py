@@ -170,9 +170,9 @@ def path_losses_and_slopes(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
-    The derivatives are with respect to the material constants in `columns` of the tables. They are 0 for a link without
-    a path. The third result is the largest error of a tabulated coefficient by candidate, material and mode [count, M,
-    3]; it is zero without tables.
+    The derivatives are with respect to the material constants in `columns` of the tables. All derivatives are 0 for a
+    link without a path. The third result is the largest error of a tabulated coefficient by candidate, material and
+    mode [count, M, 3]; it is zero without tables.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):

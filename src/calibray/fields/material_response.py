@@ -179,7 +179,8 @@ def _unpacked(
 
 
 LARGEST_EXPONENT = 64
-"""Largest exponent alpha for which the normalization is a sum. Above it, a Gaussian lobe is accurate to 0.0021 dB."""
+"""Largest exponent alpha for which the normalization is a sum. Above this exponent, a Gaussian lobe is accurate to
+0.0021 dB."""
 
 
 def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
