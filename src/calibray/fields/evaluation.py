@@ -139,7 +139,7 @@ def path_losses(
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
     Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
-    candidate, material and mode [count, M, 3]; it is zero without tables. Only the first `count` candidates are
+    candidate, material and mode [count, M, 3]. Without tables, this error is 0. Only the first `count` candidates are
     evaluated. The function is compiled for batches of n candidates, so a partly filled batch needs no new compilation.
     """
     count = len(tables) if count is None else count
@@ -172,7 +172,7 @@ def path_losses_and_slopes(
 
     The derivatives are with respect to the material constants in `columns` of the tables. All derivatives are 0 for a
     link without a path. The third result is the largest error of a tabulated coefficient by candidate, material and
-    mode [count, M, 3]; it is zero without tables.
+    mode [count, M, 3]. Without tables, this error is 0.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
