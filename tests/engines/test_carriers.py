@@ -400,7 +400,7 @@ def test_prediction_takes_the_carrier_of_each_link_or_else_the_scenes(
             r"row 3: the frequency 28\.5 must be between 1e\+06 and 1e\+12 Hz .*write 28\.5 GHz as 28\.5e9",
         ),
         (-1e9, r"row 3: the frequency -1e\+09 must be"),
-        (np.nan, r"column 'carrier' is missing or not finite in 1 of 24 rows \(row 3\)"),
+        (np.nan, r"column 'carrier' has missing or non-finite values in 1 of 24 rows \(row 3\)"),
     ],
 )
 def test_frequencies_that_are_none(folder: Path, value: float, message: str) -> None:

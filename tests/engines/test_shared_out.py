@@ -190,7 +190,7 @@ def test_a_row_that_cannot_be_used_is_refused_before_any_is_traced(found, tmp_pa
     monkeypatch.setattr(batches, "BATCH", 9)
     monkeypatch.setattr(Setup, "trace", None)
     rows = predict_batches(found, PiecedTable.open(tmp_path / "links.parquet"), None)
-    with pytest.raises(InputError, match="'rx_x' is missing or not finite in 1 of 4 rows"):
+    with pytest.raises(InputError, match="'rx_x' has missing or non-finite values in 1 of 4 rows"):
         next(rows)
 
 

@@ -120,7 +120,7 @@ def test_weights_and_deviations_of_averages_are_means(key):
         ({"t": [1.78e12, 1.78e12 + 9e3]}, {"by": "time", "time": "t"}, "column 't': .* give seconds"),
         ({"t": ["2026-05-01", None]}, {"by": "time", "time": "t"}, "column 't': a time is missing"),
         ({"rx_x": ["here", "there"]}, {}, "'here' is not a number"),
-        ({"power": [-80.0, np.nan]}, {}, "missing or not finite in 1 of 2 rows"),
+        ({"power": [-80.0, np.nan]}, {}, "missing or non-finite values in 1 of 2 rows"),
     ],
 )
 def test_samples_that_cannot_be_averaged_are_refused(changes, arguments, message):

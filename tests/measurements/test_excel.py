@@ -53,7 +53,7 @@ def test_faulty_workbooks_are_refused(tmp_path, monkeypatch):
         (datetime(2026, 5, 1), r"row 3, column 'loss': '2026-05-01 00:00:00' is not a number"),
         ("=B2+1", r"row 3, column 'loss': '=B2\+1' is not a number"),
         ("#DIV/0!", r"row 3, column 'loss': '#DIV/0!' is not a number"),
-        (None, r"column 'loss' is missing or not finite in 1 of 3 rows \(row 3\)"),
+        (None, r"column 'loss' has missing or non-finite values in 1 of 3 rows \(row 3\)"),
     ],
     ids=["date", "formula", "error", "gap"],
 )

@@ -141,7 +141,9 @@ def test_a_missing_height_of_a_transmitter_is_named_in_its_own_table(log):
     sites = SourceTable(pd.DataFrame({"site": ["a", "b"], "up": [525.0, np.nan]}), source="sites.csv")
     steps = Preparation(frame=FRAME, transmitters=sites, transmitter="site")
     placed = (11.5755, 48.1374, "up")
-    message = r"^sites\.csv: column 'up' is missing or not finite for site b \(1 of 2 rows of log\.csv\)"
+    message = (
+        r"^sites\.csv: column 'up' has missing or non-finite values for site b \(1 of 2 rows of log\.csv\)"
+    )
     with pytest.raises(InputError, match=message):
         links_from_table(
             log.assign(site=["a", "b"]), "site", steps=steps, tx=placed, rx=("lon", "lat", "alt")

@@ -383,5 +383,7 @@ def test_an_empty_bearing_of_an_omnidirectional_antenna_counts_as_zero(planted: 
     columns = _column_values(result, np.array([40.0, 0.0, 10.0]), {"transmitter": "omni"})
     assert np.isnan([columns["bearing"], columns["tilt"]]).all()
     sites.assign(antenna="sector").to_csv(planted.path.parent / "gaps.csv", index=False)
-    with pytest.raises(InputError, match=r"column 'bearing' is missing or not finite for transmitter omni"):
+    with pytest.raises(
+        InputError, match=r"column 'bearing' has missing or non-finite values for transmitter omni"
+    ):
         Setup.open(study, tracer=TwoRay).mountings  # noqa: B018

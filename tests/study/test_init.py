@@ -487,7 +487,7 @@ def test_faults_of_the_table_of_transmitters_are_named(scene, tmp_path):
     file = table(tmp_path, x=np.arange(10.0), y=20.0, cell=list("AB" * 5), rssi=np.arange(-90.0, -80.0))
     sites.write_text("cell,x,y,z,Frequency (Hz)\nA,-30,0,15,1842.5\nB,60,0,15,1842.5\n")
     with pytest.raises(
-        InputError, match=r"sites.csv: column 'Frequency \(Hz\)' has values of about 1842.5, must"
+        InputError, match=r"sites.csv: column 'Frequency \(Hz\)' has values of about 1842.5; it must"
     ):
         draft(scene, file, study, sites)
     sites.write_text('cell,x,y,z\nA,"-30,0",0,15\nB,"60,5",0,15\n')

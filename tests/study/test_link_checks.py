@@ -453,6 +453,6 @@ def test_a_log_in_another_time_zone_than_its_track_is_named(town):
 
     assert found("0 min") == found("1 h", clock=3600.0) == ""
     assert (
-        "30 rows without a position on the track, left out, which links.track.clock = 3600 would keep"
+        "30 rows without a position on the track, left out; links.track.clock = 3600 would keep more of them"
         in found("1 h")
     )

@@ -68,8 +68,8 @@ PATTERNS: Final = {
     "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
     "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Recognized words in column names, without accents, by content of the column. Case and punctuation are ignored. To add
-a word, extend the pattern of its content."""
+"""Recognized words in column names, without accents, by the content of the column. Case and punctuation are ignored.
+To add a word, extend the pattern for the content."""
 
 LENGTH_UNITS: Final = {
     "cm": 0.01,
@@ -219,7 +219,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 
 
 def text_instead(frame: pd.DataFrame, *rows: str) -> str:
-    """Hint about a column whose name matches one of the given entries of `PATTERNS` but which contains text, or "".
+    """Hint about a text column whose name matches one of the given entries of `PATTERNS`; empty if there is none.
 
     Example:
         >>> text_instead(pd.DataFrame({"Lat": ["51.2N", "51.3N"], "cell": "A"}), "latitude")
@@ -240,14 +240,14 @@ def no_degrees(frame: pd.DataFrame) -> str:
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
-        "; column 'lat' has values of about 4734, not degrees; convert NMEA values, or rename to x and y if in metres"
+        "; column 'lat' has values of about 4734, not degrees; convert NMEA values, or rename metres to x and y"
     """
     for name in numeric_columns(frame):
         largest = 90 if matches(name, "latitude") else 180
         if matches(name, "latitude", "longitude") and (median := abs(frame[name].median())) > largest:
             return (
                 f"; column {shortened(name)!r} has values of about {median:.0f}, not degrees; convert NMEA "
-                "values, or rename to x and y if in metres"
+                "values, or rename metres to x and y"
             )
     return ""
 
@@ -298,9 +298,9 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values and identify the measured quantity.
 
-    Path loss is preferred to path gain, and path gain to received power. Columns of received power other than that of
-    reference signals come last if their names contain no decibel unit. Whether a column is a loss or a gain follows
-    from the sign of its values.
+    Path loss is preferred to path gain, and path gain to received power. Columns whose names contain no decibel unit
+    come last if they contain received power other than that of reference signals. The sign of the values determines
+    whether a column contains losses or gains.
 
     Raises:
         InputError: No column appears to contain path loss, path gain or received power.
@@ -359,7 +359,7 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
 
 
 def find_length_unit(names: Iterable[str]) -> float:
-    """Find the unit of length in column names, as its length [m]; 1 if no name contains a unit.
+    """Find the unit of length in column names, and return its length [m]; 1 if no name contains a unit.
 
     Raises:
         InputError: The names contain different units.
@@ -377,7 +377,7 @@ def find_length_unit(names: Iterable[str]) -> float:
 
 
 def find_frequency_unit(name: str, default: str = "hz") -> float:
-    """Find the unit of frequency in a column name, in hertz; `default` if the name contains no unit.
+    """Find the unit of frequency in a column name, and return its value in hertz; without a unit, use `default`.
 
     Example:
         >>> find_frequency_unit("Downlink [MHz]"), find_frequency_unit("carrier")
@@ -414,19 +414,19 @@ def no_frequency(frame: pd.DataFrame) -> str:
 
     Example:
         >>> no_frequency(pd.DataFrame({"Frequency (Hz)": [1842.5]}))
-        "column 'Frequency (Hz)' has values of about 1842.5, must be 1e+06 to 1e+12 Hz; correct the unit in its name"
+        "column 'Frequency (Hz)' has values of about 1842.5; it must be 1e+06 to 1e+12 Hz: correct the unit in its name"
     """
     for name in _frequency_columns(frame):
         if frame[name].notna().any() and not matches(name, "bandwidth or shift"):
             return (
-                f"column {shortened(name)!r} has values of about {frame[name].median():g}, must be "
-                f"{FREQUENCIES[0]:.0e} to {FREQUENCIES[1]:.0e} Hz; correct the unit in its name"
+                f"column {shortened(name)!r} has values of about {frame[name].median():g}; it must be "
+                f"{FREQUENCIES[0]:.0e} to {FREQUENCIES[1]:.0e} Hz: correct the unit in its name"
             )
     return ""
 
 
 def _frequency_columns(frame: pd.DataFrame) -> list[str]:
-    """Numeric columns whose names contain a word for frequency, followed by those that contain only its unit."""
+    """Numeric columns whose names contain a word for frequency, followed by columns whose names contain only a unit."""
     names = numeric_columns(frame)
     in_hertz = [
         name for name in names if words(name) & {*FREQUENCY_UNITS} and not matches(name, "bandwidth or shift")

@@ -88,7 +88,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
     Lines above the header are skipped if most of their cells are empty or if their number of cells differs. Units in a
     row below the header are appended to the column names. Cells in a column of numbers can contain placeholders
-    (`PLACEHOLDERS`). The same decibel unit can follow every number in the column.
+    (`PLACEHOLDERS`). The same decibel unit can follow every number in a column.
 
     Args:
         path: Path of the file, for messages.
@@ -97,7 +97,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
     Raises:
         InputError: The text is malformed, or its header or decimal mark is ambiguous.
-        KeyboardInterrupt: Ctrl-C arrived while pandas was reading.
+        KeyboardInterrupt: The user pressed Ctrl-C while pandas was reading.
 
     Example:
         >>> text = "Logger 2.1\nx;y;Pegel\nm;m;dBm\n1,5;2;-70,5\n2,5;2;-\n"
@@ -178,7 +178,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Split the first non-blank records into cells, with the indices of each one's first line and of the line after."""
+    """Split the first non-blank records into cells, with the indices of their first lines and of the next lines."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -220,9 +220,10 @@ def _with_unit(name: object, unit: str) -> str:
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
-    """Convert a column of strings to numbers, which may be placeholders or have a common decibel unit.
+    """Convert a column of strings to numbers.
 
-    If another string occurs, only leading and trailing white space is removed.
+    The strings can be numbers, numbers with a common decibel unit, or placeholders. If any other
+    string occurs, the column remains text without leading and trailing white space.
     """
     if not pd.api.types.is_string_dtype(column):
         return column
@@ -276,7 +277,7 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Read the header of a CSV text and the line number of each row; refuse faults that pandas would correct silently.
+    """Read the header of a CSV text and the line number of each row; reject faults that pandas would correct silently.
 
     The third result is true if every row ends with an additional empty cell.
 

@@ -25,19 +25,19 @@ from calibray.errors import InputError
 from calibray.support.messages import did_you_mean, shortened
 
 MAX_LENGTH: Final = 10_000
-"""Largest number of characters in a filter."""
+"""Maximum number of characters in a filter."""
 
 MAX_PARTS: Final = 2_000
-"""Largest number of names, values and operators in a filter."""
+"""Maximum number of names, values and operators in a filter."""
 
 MAX_DEPTH: Final = 50
 """Largest nesting depth of a filter."""
 
 MAX_PATTERN_LENGTH: Final = 200
-"""Largest number of characters in a regular expression."""
+"""Maximum number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Largest sum of the squared lengths of the texts in a column that a pattern with a repetition may search. At this
+"""Maximum sum of the squared lengths of the texts in a column that a pattern with a repetition may search. At this
 limit, a search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
@@ -83,7 +83,7 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Refuse to compare a column of text only with numbers, or a column of numbers only with text."""
+    """Reject a comparison of a text column with only numbers, or of a numeric column with only text."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
@@ -153,9 +153,11 @@ _REPETITION: Final = re.compile(rf"(?:{_CLASS}|\\.|[^*+?])*+[*+?]")
 
 
 def _check_pattern(pattern: str, column: pd.Series) -> None:
-    """Refuse a regular expression that is malformed or could take too long to search a column."""
+    """Reject a regular expression that is malformed or could take too long to search a column."""
     if len(pattern) > MAX_PATTERN_LENGTH:
-        raise InputError(f"{len(pattern)} characters, must be at most {MAX_PATTERN_LENGTH}; shorten it")
+        raise InputError(
+            f"{len(pattern)} characters, but at most {MAX_PATTERN_LENGTH} are allowed; shorten it"
+        )
     try:
         re.compile(pattern)
     except (re.error, OverflowError) as error:
@@ -167,7 +169,8 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
             "a pattern can contain only characters, classes, ^, $, | and one *, + or ? per alternative; set "
             "regex=False to search for plain text"
         )
-    # A match attempt at each position may run to the end of the text, so the cost is quadratic in its length.
+    # A match attempt at each position may run to the end of the text, so the cost is quadratic in the length of the
+    # text.
     if _REPETITION.match(pattern):
         steps = float((column.dropna().astype(str).str.len().astype(float) ** 2).sum())
         if steps > MAX_SEARCH_STEPS:
@@ -192,7 +195,8 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     if len(expression) > MAX_LENGTH:
         raise InputError(f"{len(expression)} characters, must be at most {MAX_LENGTH}; shorten it")
     code, backticked = _as_python(expression.strip())
-    # Python warns about escapes in strings, and pandas about groups in patterns; neither helps the author of a filter.
+    # Python warns about escapes in strings, and pandas about groups in patterns; neither warning helps the author of a
+    # filter.
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         result = _Interpreter(frame, code, backticked).value(_parse(code, frame))
@@ -300,7 +304,8 @@ class _Interpreter:
         return InputError(f"{shortened(piece)}: {fault}")
 
     def _name(self, node: ast.Name) -> _Value:
-        # Python normalizes identifiers: a full-width x becomes a plain x. Columns are looked up as written instead.
+        # Python normalizes identifiers: a full-width x becomes a plain x. Column names are therefore looked up as
+        # written.
         written = ast.get_source_segment(self._code, node) or node.id
         name = self._backticked.get(written, written)
         if name not in self._frame:
@@ -410,7 +415,7 @@ class _Interpreter:
             raise self._refusal(node, "only + - * / // % ** are allowed between numbers")
         left, right = self._number(node.left), self._number(node.right)
         if isinstance(node.op, ast.Pow):
-            # In floating point, a power of whole numbers neither takes long nor wraps around.
+            # In floating point, raising a whole number to a power is fast and does not wrap around.
             left, right = _as_floats(left), _as_floats(right)
         # Whole numbers in columns wrap around silently, and division by zero gives infinity; `_overflows` detects
         # both.

@@ -17,7 +17,8 @@ from calibray.support.messages import first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance below which a transmitter and a receiver count as coincident [m]. Their path loss would be undefined."""
+"""Distance below which a transmitter and a receiver are treated as coincident [m]. The path loss between coincident
+points is undefined."""
 
 FEW: Final = 8
 """Smallest number of links from which a trend, a noise model or a prediction error is estimated."""
@@ -146,7 +147,7 @@ class Measurements:
         """Index of each link's group in `group_names` [links]."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
-        # Every group is among the sorted names, so the insertion point is its index.
+        # Every group is among the sorted names, so its insertion point is its index.
         return np.searchsorted(self.group_names, self.group)
 
     @property
@@ -224,7 +225,7 @@ def _as_array(name: str, values: ArrayLike, dtype: type) -> NDArray[np.generic]:
 
 
 def _check_links(links: Measurements) -> None:
-    """Refuse links that no engine can evaluate."""
+    """Reject links that no engine can evaluate."""
     checks = (
         (~np.isfinite(links.tx).all(axis=1), "the transmitter's position is not finite; correct it"),
         (~np.isfinite(links.rx).all(axis=1), "the receiver's position is not finite; correct it"),

@@ -99,7 +99,7 @@ def read_multipath(
             name.
     """
     table = read_table(path)
-    # Names as words joined by underscores, such as delay_ns for "Delay [ns]".
+    # Column names as words joined by underscores, such as delay_ns for "Delay [ns]".
     names = {
         str(name): "_".join(re.findall(r"[a-z0-9]+", str(name).lower()))
         for name in table.frame.columns
@@ -177,7 +177,7 @@ def read_multipath(
 
 
 def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
-    """Refuse components whose delay or level is impossible or a code for a missing value.
+    """Reject components whose delay or level is impossible or a code for a missing value.
 
     Raises:
         InputError: A value is not plausible.
@@ -198,14 +198,14 @@ def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
-    """Compute a statistic for each link in SI units, averaged over its snapshots; the keys are the labels of the links.
+    """Compute a statistic in SI units for each link, averaged over the snapshots; the keys are the labels of the links.
 
     A snapshot with a single component has no K-factor and is excluded from the mean. Links without any component that
     the receiver detects are excluded. The bandwidth of the receiver is not applied, because it has already shaped the
     measured components.
 
     Raises:
-        InputError: The statistic requires angles, but they were not measured or are in several columns.
+        InputError: The statistic requires angles that were not measured or that are in several columns.
 
     Example:
         >>> paths = Multipath(np.array(["a", "a"]), np.array(["", ""]), np.array([1e-7, 2e-7]), np.zeros(2))
@@ -276,7 +276,7 @@ def _value(
 
 ENDINGS: Final = (".npz", ".npy", ".mat", ".h5", ".hdf5")
 MOST_BYTES: Final = 4 << 30
-"""Largest allowed total size of the arrays in a file [bytes]."""
+"""Maximum total size of the arrays in a file [bytes]."""
 
 DELAYS: Final = ("delay", "delays", "tau", "time", "t")
 """Recognized names of the array that contains the delays of the samples [s]."""

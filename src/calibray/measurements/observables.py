@@ -1,4 +1,4 @@
-"""Observables of links in addition to path loss: measured statistics of the paths, and their units."""
+"""Link observables other than path loss: measured statistics of the propagation paths, and their units."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ KINDS: Final = {
 """Kinds of observables and the units of their values."""
 
 FLIGHTS: Final = (TIME_OF_FLIGHT, ROUND_TRIP)
-"""Kinds that are travel times. Measured travel times can include a bias of the device."""
+"""Kinds of observables that are travel times. Measured travel times can include a device bias."""
 
 SECTORS: Final = (DEPARTURE_SECTOR, ARRIVAL_SECTOR)
 PROFILES: Final = (DELAY_BIN, *SECTORS)
-"""Kinds whose value is the fraction of a link's power in a bin. Each bin is a separate observable."""
+"""Kinds of observables whose value is the fraction of a link's power in a bin. Each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
-"""Kinds whose measured values can be negative: values in decibels, and times from a clock with a bias."""
+"""Kinds of observables with possibly negative measured values: decibels, and times from a clock with a bias."""
 
 SHARE_RANGE_DB: Final = 30.0
 """Default dynamic range of the fraction of power in a bin [dB]."""
 
 ROUNDING: Final = 1e-12
 """Tolerance within which a delay [s] or azimuth [rad] counts as equal to a limit. Samples at multiples of 1 / bandwidth
-can lie exactly at a limit. The tolerance exceeds the rounding errors of differences between delays or azimuths, and is
-below the resolution of any receiver."""
+can lie exactly on a limit. The tolerance is larger than the rounding error of a difference between delays or azimuths,
+but smaller than the resolution of any receiver."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class Statistic:
 
     Attributes:
         kind: One of `KINDS`.
-        path: Path that determines a time of flight: "mean" (the mean over all paths), "first" or "strongest".
-        dynamic_range_db: Range below the strongest path in which the receiver detects paths [dB]; None if it detects
-            all paths.
+        path: Path whose delay is the time of flight: "first", "strongest", or "mean" (the mean over all paths).
+        dynamic_range_db: Power range below the strongest path in which the receiver detects paths [dB]; None if the
+            receiver detects all paths.
         floor_db: Path gain below which the receiver detects no paths [dB]; None for no limit.
         window: Longest delay after the first path [s]; None for no limit.
         bandwidth: Bandwidth of the receiver [Hz]; None if the receiver resolves all paths.
@@ -83,18 +83,18 @@ class Statistic:
     def bin(self) -> tuple[float, float]:
         """Edges of the bin, both reduced by `ROUNDING`.
 
-        A value at the lower edge is inside; a value at the upper edge is outside.
+        A value at the lower edge lies inside the bin, and a value at the upper edge lies outside.
 
         Raises:
             ValueError: The statistic has no bin.
         """
         if self.edges is None:
-            raise ValueError(f"{self.kind}: needs the edges of the bin")
+            raise ValueError(f"{self.kind}: the edges of the bin are required")
         low, high = self.edges
         return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
-        """Fractions of power in a bin [dB], plus the fraction at the lower end of the dynamic range.
+        """Add the power fraction at the lower end of the dynamic range to the power fractions in a bin [dB].
 
         An empty bin therefore has a finite value both in the model and in the measurements.
 
@@ -114,7 +114,7 @@ class Wanted:
         name: Name of the observable in the study.
         statistic: The statistic.
         unit: Unit in which the program returns the statistic.
-        scale: Value of this unit in SI units.
+        scale: Factor that converts values in this unit to SI units.
     """
 
     name: str
@@ -123,6 +123,6 @@ class Wanted:
     scale: float
 
     def record(self) -> dict[str, object]:
-        """The description sent to the program: name, kind, unit, and the limits stated in the study."""
+        """The description that is sent to the program: name, kind, unit, and the limits stated in the study."""
         limits = {key: value for key, value in asdict(self.statistic).items() if value is not None}
         return {"name": self.name, "unit": self.unit, **limits}

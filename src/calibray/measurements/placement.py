@@ -1,4 +1,4 @@
-"""Determine the positions of both ends of each row in the scene frame, and move receivers out of buildings."""
+"""Determine the transmitter and receiver position of each row, and move receivers out of buildings."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.support.messages import first_line
 
 TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
-"""The columns with the position of a row on a track [deg]."""
+"""Columns that contain the position of a row on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
 """The entry in `changes` for rows that a track does not cover. If another time zone fits clearly better, the entry also
-states the `links.track.clock` for it."""
+states the value of `links.track.clock` for that time zone."""
 
 MAX_FILE_SIZE: Final = 200_000_000
 """Size limit of a GPX file [bytes]. A track with one point per second reaches this size after three weeks."""
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
-    """Add the positions on a track to rows, interpolated linearly in time; rows that it does not cover are left out.
+    """Interpolate a track linearly at the times of the rows; rows that the track does not cover are left out.
 
     Times are in ISO 8601 (UTC unless a time zone is stated) or in seconds since 1970. Altitudes are not used, because
     altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
@@ -44,15 +44,15 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
     if not covered.any():
         first, last = points["time"].iloc[0], points["time"].iloc[-1]
         remedy = (
-            f"with {clock}, some would be; check the time zone"
+            f"with {clock}, some times would lie on the track; check the time zone"
             if shift
             else "check the time zone and the clock"
         )
         raise InputError(
-            f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} is on the track, "
+            f"{table.source} with {track.file}: no time in column {track.time!r} lies on the track, "
             f"which covers {first} to {last}; {remedy}"
         )
-    table = table.keep(covered, NOT_ON_TRACK + (f", which {clock} would keep" if shift else ""))
+    table = table.keep(covered, NOT_ON_TRACK + (f"; {clock} would keep more of them" if shift else ""))
     # Unwrapped longitudes continue beyond 180 degrees where the track crosses the antimeridian.
     longitude = np.interp(seconds[covered], times, np.unwrap(points["longitude"], period=360.0))
     latitude = np.interp(seconds[covered], times, points["latitude"])
@@ -60,7 +60,7 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
 
 
 def read_times(table: SourceTable, name: str) -> NDArray[np.float64]:
-    """Read a column of times, in ISO 8601 or in seconds since 1970, as seconds since 1970 [rows]; NaN if missing.
+    """Read a column of times in ISO 8601 or in seconds since 1970; returns seconds since 1970 [rows], NaN if missing.
 
     Raises:
         InputError: There is no such column, or a time cannot be read.
@@ -98,9 +98,9 @@ def _covered(
 ) -> NDArray[np.bool_]:
     """Mask [rows] of the rows between two successive track points whose times differ by at most `longest_gap`."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
-    # For a row at exactly the time of a point, the gaps next to this point do not matter.
+    # If a row has exactly the time of a track point, the gaps next to this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
-    # Before the track, after it, and at missing times (NaN), one of the comparisons is false.
+    # For times before or after the track, and for missing times (NaN), at least one of the comparisons is false.
     between = (times[before] <= seconds) & (seconds <= times[after])
     return between & (times[after] - times[before] <= longest_gap)
 
@@ -108,8 +108,8 @@ def _covered(
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
     """Time-zone shift of the rows relative to the track [s]; 0 unless a shift places clearly more rows on the track.
 
-    Time zones are tested if at least a tenth of the rows are off the track. A shift must more than halve the number of
-    these rows.
+    Shifts are tested only if at least a tenth of the rows are off the track. A shift is accepted only if it more than
+    halves the number of these rows.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]
@@ -122,7 +122,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
 
 
 def _reason(error: Exception) -> str:
-    """The reason why pandas cannot read a time, without pandas' advice on its arguments."""
+    """The reason why pandas cannot read a time, without the advice of pandas on function arguments."""
     return first_line(error).partition(". You might")[0]
 
 
@@ -135,7 +135,7 @@ def _read_gpx(path: Path) -> pd.DataFrame:
     """Time (UTC), longitude and latitude [deg] of all track points, in chronological order."""
     try:
         if path.stat().st_size > MAX_FILE_SIZE:
-            raise InputError(f"track {path}: larger than {MAX_FILE_SIZE / 1e6:.0f} MB; split the file")
+            raise InputError(f"track {path}: the file is larger than {MAX_FILE_SIZE / 1e6:.0f} MB; split it")
         text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"track {path}: does not exist; check the path") from None
@@ -182,17 +182,17 @@ def _tag(element: ElementTree.Element) -> str:
 
 
 TX_COLUMNS: Final = ("tx_x", "tx_y", "tx_z")
-"""The columns of transmitter positions in the scene frame [m]."""
+"""Columns of transmitter positions in the scene frame [m]."""
 
 RX_COLUMNS: Final = ("rx_x", "rx_y", "rx_z")
-"""The columns of receiver positions in the scene frame [m]."""
+"""Columns of receiver positions in the scene frame [m]."""
 
 POSITION_COLUMNS: Final = (*TX_COLUMNS, *RX_COLUMNS)
-"""The columns of the positions of both ends [m]."""
+"""Columns of transmitter and receiver positions in the scene frame [m]."""
 
 
 def position_columns(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """The columns `POSITION_COLUMNS` of links with ends at `tx` ([3] if all are equal) and `rx` [n, 3], [m]."""
+    """`POSITION_COLUMNS` of links from `tx` ([n, 3], or [3] for a single transmitter) to `rx` [n, 3], in metres."""
     ends = np.hstack([np.broadcast_to(tx, rx.shape), rx])
     return dict(zip(POSITION_COLUMNS, ends.T, strict=True))
 
@@ -209,9 +209,9 @@ def place_rows(
 ) -> tuple[SourceTable, Coordinates, Coordinates]:
     """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
-    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude and
-    latitude [deg] and height [m]. The result is the table with these columns, and their names for both ends. If a
-    filter is the only step, the arguments are returned unchanged.
+    A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude, latitude
+    [deg] and height [m]. Returns the table with these columns, and the names of the columns for both ends. If a filter
+    is the only step, the arguments are returned unchanged.
 
     Raises:
         InputError: A column is missing or not numeric, or a geographic position is invalid.
@@ -227,7 +227,7 @@ def _positions(
 ) -> NDArray[np.float64]:
     """Positions [rows, 3], [m] of one end."""
     if steps.frame is None:
-        # Numbers are in metres, columns in the table's unit.
+        # Numbers are in metres, and columns are in the unit of the table.
         scale = [steps.unit_m if isinstance(coordinate, str) else 1.0 for coordinate in coordinates]
         positions = table.positions(end, coordinates) * scale
         height = positions[:, 2]
@@ -248,10 +248,10 @@ def _positions(
 
 
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
-    """Leave out or move receivers that are inside the outlines of buildings.
+    """Leave out or move receivers inside building outlines.
 
-    The steps `inside` and `outside` are used. Without these steps, the table is returned unchanged. With the step
-    `ground`, moved receivers keep their heights above the ground.
+    The function uses the steps `inside` and `outside`. Without these steps, it returns the table unchanged. With the
+    step `ground`, moved receivers keep their heights above the ground.
 
     Raises:
         InputError: No row remains.

@@ -20,15 +20,15 @@ Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64
 """Height of the ground [m] as a function of x and y [m]."""
 
 MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Function from positions [n, 3], [m] to positions outside buildings (NaN if too deep inside) and the distances of the
-moves [n], [m]."""
+"""Function that moves positions [n, 3], [m] out of buildings. It returns the new positions, which are NaN if too deep
+inside a building, and the distances moved [n], [m]."""
 
 Compute = Callable[[SourceTable], NDArray[np.float64] | None]
-"""Function from the rows of a table to the values of a new column [rows]; it returns None if a required column is
+"""Function that computes a new column [rows] from the rows of a table; it returns None if a required column is
 missing."""
 
 Divide = Callable[[SourceTable], NDArray[Any]]
-"""Function from the rows of a table to the labels of the parts to which the rows belong [rows]."""
+"""Function that splits a table into parts; it returns, for each row, the label of its part [rows]."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,14 @@ class LinkColumns:
         tx: Transmitter position: x, y, z [m], or longitude, latitude [deg] and height [m].
         rx: Receiver position, in the same form.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for a received power with
-            an unknown transmitted power. With "rsrp", the path loss is the negative of the received power, and an
-            offset includes the transmitted power.
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for received power if the
+            transmitted power is unknown. With "rsrp", the path loss is the negative of the received power, and the
+            offset of the study includes the transmitted power.
         group: Column of group labels, or several columns whose labels are joined.
         weight: Column of relative weights [1], greater than 0.
-        std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
-        tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power".
-        frequency: Column of carrier frequencies, in hertz or in the unit that its name states.
+        std: Standard deviation of the values [dB], as a number or a column; the weights are then 1 / std^2.
+        tx_power_dbm: Transmitted power [dBm], as a number or a column; allowed only with "received_power".
+        frequency: Column of carrier frequencies, in hertz or in the unit stated in the column name.
 
     Raises:
         InputError: The quantity is unknown or is inconsistent with `tx_power_dbm`, or both `weight` and `std` are
@@ -86,8 +86,8 @@ class Averaging:
 
     Attributes:
         by: Samples that are averaged together: samples at one "place" (the same receiver position), in one "cell" of a
-            square grid, in one interval of "distance" travelled (in row order, separately for rows that are never
-            averaged together, such as those of different devices), or in one window of "time".
+            square grid, in one interval of "distance" travelled, or in one window of "time". Distance is summed in row
+            order, separately for rows that are never averaged together, such as rows of different devices.
         size: Width of a cell or length of an interval [m], or duration of a window [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
@@ -103,7 +103,7 @@ class Averaging:
 
 @dataclass(frozen=True)
 class Track:
-    """A GPX track from which the positions of rows are interpolated at their times.
+    """A GPX track from which the positions of rows are interpolated in time.
 
     Attributes:
         file: The GPX file.
@@ -133,20 +133,20 @@ class Preparation:
         censored: Whether links at or below the noise floor are kept as censored links.
         frame: Georeference of the scene if positions are geographic; None if positions are in the scene frame.
         crs: Coordinate reference system of the positions; used only with `frame`.
-        unit_m: Unit of the position columns in the scene frame [m].
+        unit_m: Length of the unit of the position columns in the scene frame [m].
         ground: Function that returns the height of the ground; None if heights are not measured from the ground.
-        averaging: How samples are averaged.
+        averaging: Rule for averaging samples; None if samples are not averaged.
         keep: Columns whose labels define groups that are averaged separately, in addition to the transmitter column.
         held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
             merged across parts.
         observables: Columns of additional measured values, such as delays, which are averaged over the rows of a link.
             Codes for missing values in these columns are treated as missing.
-        means: Columns of other numbers that are averaged over the rows of a link, such as those of nuisances.
+        means: Columns of other numbers that are averaged over the rows of a link, such as the columns of nuisances.
         flights: Columns of times of flight, in which codes of any magnitude are treated as missing values.
         computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
             been added. A function returns None if an optional column that it requires is missing.
-        check: Function that refuses a table without a required column, called after the columns of the transmitters
-            have been added.
+        check: Function that rejects a table without a required column. It is called after the columns of the
+            transmitters have been added.
         inside: Treatment of receivers inside buildings: "drop", "move", or None to keep their positions.
         outside: Function that moves positions out of buildings; required with `inside`.
     """
@@ -176,7 +176,7 @@ class Preparation:
 
     @property
     def is_filter_only(self) -> bool:
-        """Whether there is no step other than a filter, so the remaining rows are already links."""
+        """Whether no step other than a filter is set, so that the remaining rows are already links."""
         steps = (
             *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
             *(self.averaging, self.inside),

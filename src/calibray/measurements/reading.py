@@ -1,4 +1,4 @@
-"""Conversion of a table to links: read the file, select and position rows, average or merge them, and check the links.
+"""Convert a table to links: read the file, select and position rows, average or merge them, and check the links.
 
 Samples are averaged in linear power into one row per area or position. Along a street, the power fades by several dB
 within a wavelength. Ray tracing to a single point does not predict this fading, but it does predict the mean power over
@@ -55,15 +55,15 @@ def read_measurements(
         rx: Receiver position, in the same form.
         value: Column of the measured values.
         quantity: The measured quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for
-            a received power with an unknown transmitted power (see `LinkColumns`).
+            received power if the transmitted power is unknown (see `LinkColumns`).
         where: Row filter on the columns (see `filters`). Rows that do not pass are removed before any check.
         group: Column of group labels.
         weight: Column of relative weights [1], greater than 0.
-        std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
-        tx_power_dbm: Transmitted power [dBm], a number or a column; only for "received_power". The path loss is this
-            power minus the received power, and includes antenna gains and cable losses.
-        frequency: Column of carrier frequencies, in hertz or in the unit that its name states, for links at several
-            frequencies.
+        std: Standard deviation of the values [dB], as a number or a column; the weights are then 1 / std^2.
+        tx_power_dbm: Transmitted power [dBm], as a number or a column; allowed only with "received_power". The path
+            loss is the transmitted power minus the received power, and includes antenna gains and cable losses.
+        frequency: Column of carrier frequencies, in hertz or in the unit stated in the column name, for links at
+            several frequencies.
 
     Returns:
         The links that pass the filter, in the order of the file.
@@ -79,7 +79,7 @@ def read_measurements(
 def measured_links(
     table: SourceTable, columns: LinkColumns, steps: Preparation | None = None
 ) -> Measurements:
-    """Convert the rows of a table to measured links. Their attribute `prepared` counts the excluded and changed rows.
+    """Convert the rows of a table to measured links; the attribute `prepared` counts the excluded and changed rows.
 
     Raises:
         InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
@@ -90,8 +90,8 @@ def measured_links(
     table = complete_rows(chosen, steps, columns.value)
     table, tx, rx = place_rows(table, steps, columns.tx, columns.rx)
     columns = replace(columns, tx=tx, rx=rx)
-    # Rows without a value can be errors or powers too weak to measure, so the user decides.
-    remedy = f'leave out these rows, in a study with links.where = "`{columns.value}`.notna()"'
+    # A missing value can be an error or a power too weak to measure, so the user decides what to do with the row.
+    remedy = f'leave out these rows: in a study, set links.where = "`{columns.value}`.notna()"'
     if columns.quantity in ("rsrp", "received_power"):
         remedy += "; if the powers were too weak to measure, state links.noise_floor_dbm"
     table.numbers(columns.value, remedy=remedy)
@@ -104,14 +104,14 @@ def measured_links(
 def _note_unused(
     table: SourceTable, chosen: SourceTable, steps: Preparation, columns: LinkColumns
 ) -> SourceTable:
-    """Record the transmitters and groups that have chosen rows, none of which is left in the table."""
+    """Record the transmitters and groups whose chosen rows have all been removed from the table."""
     groups = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     for name in dict.fromkeys([*groups, steps.transmitter]):
         if name not in table.frame or name not in chosen.frame:
             continue
         used, rows = table.frame[name], chosen.frame[name]
         if name == steps.transmitter and steps.transmitters is not None:
-            # The join has changed the spelling of these names.
+            # Joining the table of transmitters can change the spelling of their names.
             compared = comparison(used.unique())
             used, rows = pd.Series(compared(used)), pd.Series(compared(rows))
         unused = ~rows.isin(used)
@@ -137,7 +137,8 @@ def links_from_table(
     """Create links without measured values from the rows of a table. Their path loss is NaN.
 
     If `group` names several columns, their labels are joined. `frequency` is a column of carrier frequencies. If
-    `frequency` is None or missing in the table, all links have the carrier of the study. No step may remove rows.
+    `frequency` is None or missing in the table, all links have the carrier frequency of the study. No step may remove
+    rows.
 
     Raises:
         InputError: There are no rows, a column is missing or malformed, or a position is not finite.
@@ -157,21 +158,23 @@ def links_from_table(
 
 
 PLAUSIBLE_PATH_LOSS_DB: Final = (20.0, 250.0)
-"""Range of plausible path losses [dB]. A value outside this range usually has the wrong sign or unit, or is from the
+"""Range of plausible path losses [dB]. A value outside this range usually has the wrong sign or unit, or comes from the
 wrong column."""
 
 PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
-"""Range of plausible received powers [dBm]. A value outside this range usually has the wrong sign or unit, or is from
-the wrong column."""
+"""Range of plausible received powers [dBm]. A value outside this range usually has the wrong sign or unit, or comes
+from the wrong column."""
 
 
 LINEAR: Final = 0.1
-"""If the magnitudes of all received powers in a table are below this limit, their unit is probably not dBm but, for
-example, watts."""
+"""If the magnitudes of all received powers in a table are below this limit, the powers are probably not in dBm but, for
+example, in watts."""
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
-    """Create one link from each row. Positions are in metres. The steps `noise_floor_dbm` and `censored` are used.
+    """Create one link from each row. Positions are in metres.
+
+    The function uses the steps `noise_floor_dbm` and `censored`.
 
     Raises:
         InputError: A column is missing, or a value is missing, not a number or implausible.
@@ -196,19 +199,19 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
 
 
 def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | None:
-    """Carrier frequency of each row [rows], [Hz], from a column in hertz or the unit in its name; None if not given."""
+    """Carrier frequencies [rows], [Hz], from a column in hertz or in the unit stated in its name; None without one."""
     if column is None:
         return None
     return table.numbers(column) * column_names.find_frequency_unit(column)
 
 
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
-    """Path loss [rows], [dB]; the negative received power [dBm] if the transmitted power is unknown."""
+    """Path loss [rows], [dB]; the negative of the received power [dBm] if the transmitted power is unknown."""
     measured = table.numbers(columns.value)
     if columns.quantity in ("rsrp", "received_power") and np.abs(measured).max() < LINEAR:
         raise InputError(
-            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, typical of watts; convert "
-            "the values to dBm"
+            f"{table.source}: column {columns.value!r} has values up to {measured.max():g}, which are typical of "
+            "watts; convert the values to dBm"
         )
     match columns.quantity:
         case "rsrp":
@@ -223,7 +226,7 @@ def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float6
             loss, remedy = -measured, "set quantity = 'path_loss' if the column contains path loss"
         case "received_power":
             loss = table.numbers(columns.tx_power_dbm) - measured  # type: ignore[arg-type]
-            remedy = "check tx_power_dbm and that all powers are in dBm"
+            remedy = "check tx_power_dbm, and check that all powers are in dBm"
     _check_range(table, columns, loss, PLAUSIBLE_PATH_LOSS_DB, remedy)
     return loss
 
@@ -242,7 +245,7 @@ def _check_range(
         quantity, unit = ("received power", "dBm") if columns.quantity == "rsrp" else ("path loss", "dB")
         raise InputError(
             f"{table.cell(first, columns.value)}: {table.numbers(columns.value)[first]:g} corresponds to a {quantity} "
-            f"of {values[first]:g} {unit}, must be {lowest:g} to {highest:g} {unit} ({implausible.sum()} of "
+            f"of {values[first]:g} {unit}; it must be {lowest:g} to {highest:g} {unit} ({implausible.sum()} of "
             f"{len(table)} rows); {remedy}"
         )
 
@@ -265,7 +268,7 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
 
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Largest uncertainty of an average due to samples below the noise floor [dB]; averages with a larger uncertainty are
+"""Maximum uncertainty of an average due to samples below the noise floor [dB]; averages with a larger uncertainty are
 left out."""
 
 _AREA: Final = "calibray area"
@@ -275,12 +278,11 @@ _PART: Final = "calibray part"
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
     """Average samples of the same area, transmitter, frequency and group, if `steps.averaging` is set.
 
-    A sample below the noise floor has a power between zero and the floor, and is averaged as half the floor. Averages
-    with an uncertainty above `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above the
-    floor. The steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm` are used. Each average has the
-    row of its first sample, with the mean receiver position, the mean value, and the means of weights and other
-    observables. The added columns are `std_db` (standard deviation of the samples [dB], NaN for one sample) and
-    `count`.
+    A sample below the noise floor has a power between zero and the floor, so half the floor enters the average.
+    Averages with an uncertainty above `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above
+    the floor. The function uses the steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm`. Each
+    average takes the row of its first sample, with the means of receiver position, value, weight and other observables.
+    The added columns are `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -297,7 +299,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     averaging = steps.averaging
     if averaging is None:
         return table
-    # A gain or power rises with the linear power; a loss falls with it.
+    # A gain or power increases with the linear power, whereas a loss decreases.
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * table.numbers(columns.value)
     rx = [str(name) for name in columns.rx]
@@ -327,7 +329,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
         highest = 10 ** (mean_level / 10)  # Samples below the floor count as equal to the floor.
         from_below = mean["below"].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
         lowest = np.maximum(highest - from_below, 0.0)
-        # The true mean lies between the lowest and the highest.
+        # The true mean lies between `lowest` and `highest`.
         uncertain = highest > lowest * 10 ** (MAX_UNCERTAINTY_DB / 10)
         mean_level = 10 * np.log10(highest - from_below / 2)
     if averaging.unbiased:
@@ -356,8 +358,8 @@ def _areas(
 ) -> NDArray[np.int64]:
     """Index of the position, cell, interval or window of each row [rows]; `rx` names the columns of x, y and z [m].
 
-    Rows with different numbers in `apart` [rows] are not averaged together, so each number has its own distance
-    travelled.
+    Rows with different numbers in `apart` [rows] are not averaged together, so the distance travelled is summed
+    separately for each number.
 
     Raises:
         InputError: A column is not numeric, a time cannot be read, or the size is not a number greater than 0.
@@ -372,7 +374,7 @@ def _areas(
         return np.floor((elapsed - elapsed.min()) / averaging.size).astype(np.int64)
     positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
     if averaging.by == "distance":
-        # Stretches of equal length along each track, in the order of its rows.
+        # Intervals of equal length along each track, in row order.
         steps = pd.DataFrame(positions).groupby(apart).diff().fillna(0.0)
         travelled = pd.Series(np.linalg.norm(steps, axis=1)).groupby(apart).cumsum()
         return np.floor(travelled.to_numpy() / averaging.size).astype(np.int64)
@@ -401,19 +403,19 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
 
 
 SAME_POSITION: Final = 1e-4
-"""Distance per axis up to which positions are treated as equal [m]. Coordinates are written with a resolution of a
-millimetre at best, and coordinate conversions differ by micrometres."""
+"""Difference along each axis up to which positions are treated as equal [m]. Files contain coordinates with a
+resolution of a millimetre at best, and coordinate conversions differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
     """Merge the rows of each link into the first row, with the means of linear power, weights and other numbers.
 
-    Rows belong to one link if their positions agree within `SAME_POSITION`, and the transmitter, kept columns, carrier
-    frequency, transmitted power and times are equal. Rows at different times remain separate links. Rows below the
-    noise floor are not merged with rows above the floor, and held-out rows are not merged with other rows. Receivers
-    inside buildings are moved after merging, because two positions can be moved to the same corner. The steps `keep`,
-    `held_out`, `observables`, `means`, `transmitter`, `noise_floor_dbm` and `averaging` are used. After averaging, the
-    table is unchanged, because no repeats remain.
+    Rows belong to one link if their positions agree within `SAME_POSITION`, and they have the same transmitter, kept
+    columns, carrier frequency, transmitted power and times. Rows at different times remain separate links. Rows below
+    the noise floor are not merged with rows above the floor, and held-out rows are not merged with other rows.
+    Receivers inside buildings are moved after merging, because two positions can be moved to the same corner. The
+    function uses the steps `keep`, `held_out`, `observables`, `means`, `transmitter`, `noise_floor_dbm` and
+    `averaging`. If samples were averaged, the table is returned unchanged, because no repeats remain.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -440,7 +442,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     first = ~pd.Series(link).duplicated().to_numpy()
     if first.all():
         return table
-    # A gain or power rises with the linear power; a loss falls with it.
+    # A gain or power increases with the linear power, whereas a loss decreases.
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * value
     # Powers are relative to the strongest row of each link, so that equal values remain equal to the last digit.
@@ -462,15 +464,15 @@ def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[n
 
 
 LEAST_STEP_DB: Final = 1.0
-"""Smallest effect of a label on the power [dB] that is recorded when rows with different labels become one link."""
+"""Smallest recorded effect of a label on the power [dB], if rows with different labels are merged into one link."""
 
 LEAST_RATIO: Final = 5.0
-"""Smallest recorded ratio of this effect to its standard error. One in two million labels exceeds this ratio by
-chance."""
+"""Smallest ratio of an effect to its standard error at which the effect is recorded. By chance, one in two million
+labels exceeds this ratio."""
 
 MOST_LABELS: Final = 50
-"""Largest number of labels in a column that is tested for such effects. A column with more labels probably names links
-or positions."""
+"""Maximum number of labels in a column that is tested for effects on the power. A column with more labels probably
+names links or positions."""
 
 
 def _note_steps(
@@ -480,9 +482,9 @@ def _note_steps(
     usable: NDArray[np.bool_],
     apart: Sequence[str],
 ) -> SourceTable:
-    """Record text columns, such as days, whose labels affect the power but are averaged into one link.
+    """Record text columns, such as days, whose labels affect the power but do not distinguish links.
 
-    Each link is one observation of this effect, because the rows of a link can share errors.
+    Each link counts as one observation of this effect, because the rows of a link can share errors.
 
     Args:
         table: The rows.
@@ -521,7 +523,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions; samples that differ in one are not averaged together."""
+    """Columns that distinguish links at the same positions; samples that differ in any of these are kept apart."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
@@ -535,8 +537,8 @@ def join_positions(
 ) -> NDArray[np.int64]:
     """Index of each position [N, axes], [m], among the distinct positions, in the order of first occurrence [N].
 
-    Positions within `SAME_POSITION` of each other, directly or through other positions, are treated as equal unless
-    they belong to different groups [N].
+    Positions within `SAME_POSITION` of each other, directly or through a chain of other positions, are treated as equal
+    unless they belong to different groups [N].
 
     Example:
         >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()
@@ -544,12 +546,12 @@ def join_positions(
     """
     place = np.zeros(len(positions), dtype=np.int64) if group is None else group
     count = 0
-    # Splitting along one axis opens gaps along the others.
+    # Splitting along one axis can open gaps along the other axes, so splitting is repeated until nothing changes.
     while len(place) and place.max() + 1 != count:
         count = place.max() + 1
         for axis in positions.T:
             order = np.lexsort((axis, place))
-            # A position that is not a number (NaN) is never a repeat; it is refused later.
+            # A position with a missing coordinate (NaN) is never a repeat; a later check rejects it.
             starts = (np.diff(place[order]) > 0) | ~(np.diff(axis[order]) <= SAME_POSITION)
             place = place.copy()
             place[order] = np.concatenate([[0], np.cumsum(starts)])

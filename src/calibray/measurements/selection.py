@@ -63,10 +63,10 @@ def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTab
 
 
 def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
-    """Apply the other steps of `select_rows`, which complete rows and leave out those without a usable value."""
+    """Apply the other steps of `select_rows`, which complete the rows and leave out rows without a usable value."""
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
-        # With a noise floor, a missing power was too weak to measure; without one, it carries no information.
+        # If there is a noise floor, a missing power was too weak to measure. Otherwise, it carries no information.
         if steps.noise_floor_dbm is None and coded.any():
             if coded.all():
                 raise InputError(
@@ -77,7 +77,7 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
         if name not in table.frame:
             continue
         numbers = _numbers(table.frame[name])
-        # A K-factor of -1 dB is a value, but no observable other than a time has large values of both signs.
+        # -1 dB is a valid K-factor, so only numbers of large magnitude are codes, except among times of flight.
         smallest = 0.0 if name in steps.flights else LARGEST_LEVEL
         found = [code for code in find_codes(numbers, np.inf) if abs(code) >= smallest]
         coded = np.isin(numbers, [*found, *steps.missing])
@@ -140,8 +140,8 @@ def melt(
 def plain_labels(column: Iterable[object]) -> list[str]:
     """Normalize labels: lower case, no leading or trailing white space, 5 instead of 5.0, colons instead of hyphens.
 
-    Different tools write the same address as `AA-BB` or `aa:bb`, and write whole numbers as floats if a column has
-    gaps.
+    Tools write the same address in different forms, such as `AA-BB` and `aa:bb`. They also write whole numbers as
+    floats if a column has gaps.
 
     Example:
         >>> plain_labels(["C4-64", "c4:64 ", 5.0])
@@ -154,7 +154,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """Choose how names are normalized for comparison: by `plain_labels`, or by `str` if two would become equal."""
+    """Choose how names are normalized for comparison: by `plain_labels`, or by `str` if two names became equal."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels
@@ -162,9 +162,9 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """The column with the names of the transmitters in their table; None unless exactly one column qualifies.
+    """Find the column of names in a table of transmitters; None unless exactly one column qualifies.
 
-    The values of such a column are distinct and include at least half of the given labels.
+    The values of a qualifying column are distinct and include at least half of the given labels.
 
     Example:
         >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
@@ -185,7 +185,7 @@ def distinct_rows(transmitters: SourceTable) -> SourceTable:
 
 
 def repeated_label(transmitters: SourceTable, column: str) -> str:
-    """A message that names the first repeated label in a column of names and its rows; empty if all are distinct."""
+    """Message with the first repeated label in a column of names, and its rows; empty if all labels are distinct."""
     names = transmitters.frame[column]
     if not (repeated := names.duplicated() & names.notna()).any():
         return ""
@@ -198,12 +198,12 @@ def repeated_label(transmitters: SourceTable, column: str) -> str:
 
 
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Add the columns of the table of transmitters to the links, and spell their transmitters as in that table.
+    """Add the columns of the transmitter table to the links, and adopt the spelling of its transmitter names.
 
-    The column of names in that table need not be named `key`.
+    The column of names in the transmitter table can have a name other than `key`.
 
     Raises:
-        InputError: A name is repeated or unknown, or a new column would have the name of another one.
+        InputError: A name is repeated or unknown, or a new column would have the name of an existing column.
     """
     transmitters = distinct_rows(transmitters)
     label_of_link = table.labels(key).tolist()
@@ -221,8 +221,8 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
         more = f" and {len(unknown) - MAX_LISTED} more" if len(unknown) > MAX_LISTED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
-            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add them to that table, or remove these rows, "
-            f'in a study with links.where = "`{key}` not in [{cells}]"'
+            f"rows; {did_you_mean(str(unknown[0]), labels)}; or add the names to that table, or remove these rows: "
+            f'in a study, set links.where = "`{key}` not in [{cells}]"'
         )
     index = [index_of_label[label] for label in compared_of_link]
     spelled = np.array(labels)[index]
@@ -260,11 +260,11 @@ CODES: Final = (
     *(0, 1, -1, 99, 100, 101, 127, 128, 255, 500, 999, 1000, 9999, 32767, 65535, 99999, 2147483647),
     *(-200, -255, -256, -500, -999, -1000, -9999, -32768, -99999, -2147483648),
 )  # fmt: skip
-"""Codes that loggers write for missing values, for example UJIIndoorLoc (100), Wi-Fi RTT logs (-200) and Android
-(2147483647)."""
+"""Codes for missing values in the files of loggers, for example in UJIIndoorLoc (100), Wi-Fi RTT logs (-200) and
+Android logs (2147483647)."""
 
 MIN_GAP_DB: Final = 20.0
-"""Smallest difference between a code and every measured value [dB]."""
+"""Minimum difference between a code and any measured value [dB]."""
 
 LARGEST_LEVEL: Final = 190.0
 """Largest plausible magnitude of a power [dBm] or gain [dB]. A number in `CODES` with a larger magnitude is a code
@@ -284,11 +284,11 @@ def find_codes(values: ArrayLike, largest: float = LARGEST_LEVEL) -> tuple[float
     numbers = np.asarray(values, dtype=np.float64)
     distinct = np.unique(numbers[np.isfinite(numbers)])
     is_candidate = np.isin(distinct, CODES)
-    # A path loss of 100 dB is a candidate, but close to other path losses.
+    # A path loss of 100 dB is a candidate, but it is close to other path losses.
     measured = distinct[~is_candidate]
     if not len(measured):
         return ()
-    # Losses are positive, powers and gains negative.
+    # Losses are positive, whereas powers and gains are negative.
     sign = np.sign(np.median(measured))
     return tuple(
         float(code)
@@ -307,7 +307,7 @@ def mask_codes(
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
     """Replace the codes in columns of measured values by missing values, and record the number of replaced codes.
 
-    Codes are detected in all columns together, which must therefore contain the same quantity. The `stated` codes are
+    Codes are detected in all columns together, so all columns must contain the same quantity. The `stated` codes are
     always replaced. Returns the table, and a mask [rows] of the rows that contained a code.
 
     Raises:
@@ -329,7 +329,7 @@ def mask_codes(
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """The numbers in a column [rows]; NaN for text, which a later step refuses if it uses the values."""
+    """The numbers in a column [rows]; text becomes NaN, and a later step that needs the values rejects the text."""
     if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
         return np.full(len(column), np.nan)
     return pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)

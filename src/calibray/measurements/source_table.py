@@ -1,4 +1,4 @@
-"""Rows of a table with line numbers, so that messages can name file, row and column."""
+"""Rows of a table with line numbers, so that messages can name the file, row and column."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.measurements.filters import evaluate
 from calibray.support.messages import did_you_mean, shortened
+from calibray.tables import rows_text
 
 Coordinates = Sequence[float | str]
 """x, y and z [m], or longitude, latitude [deg] and height [m]. Each coordinate is a number or the name of a column."""
@@ -51,7 +52,7 @@ class SourceTable:
 
     @property
     def tables(self) -> str:
-        """The names of the table and of the tables from which it has columns, for messages."""
+        """Names of this table and of the tables from which columns were joined, for messages."""
         return " with ".join(dict.fromkeys([self.source, *(file for file, _, _ in self.joined.values())]))
 
     def assign(self, **columns: Any) -> SourceTable:
@@ -73,7 +74,7 @@ class SourceTable:
             InputError: No row remains.
         """
         if not mask.any():
-            raise InputError(f"{self.source}: {reason}: all {len(self)} rows; change [links] in the study")
+            raise InputError(f"{self.source}: no row remains ({reason}); change [links] in the study")
         lost = int((~mask).sum())
         return (self.note(reason, lost) if lost else self).select(mask)
 
@@ -120,11 +121,11 @@ class SourceTable:
             return np.full(len(self), np.nan)
         if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
             raise InputError(
-                f"{self.source}: column {source!r} contains {column.dtype}, must contain numbers"
+                f"{self.source}: column {source!r} contains {column.dtype}; it must contain numbers"
             )
         if pd.api.types.is_bool_dtype(column) or pd.api.types.is_complex_dtype(column):
             fault = "true and false" if pd.api.types.is_bool_dtype(column) else "complex numbers"
-            raise InputError(f"{self.source}: column {source!r} contains {fault}, must contain numbers")
+            raise InputError(f"{self.source}: column {source!r} contains {fault}; it must contain numbers")
         parsed = pd.to_numeric(column, errors="coerce")
         if (text := parsed.isna().to_numpy() & ~missing).any():
             first = int(np.flatnonzero(text)[0])
@@ -143,13 +144,12 @@ class SourceTable:
                 labels = self.frame[key][unusable].unique()
                 listed = ", ".join(map(str, labels[:5])) + (", ..." if len(labels) > 5 else "")
                 raise InputError(
-                    f"{file}: column {name!r} is missing or not finite for {key} {listed} ({unusable.sum()} of "
+                    f"{file}: column {name!r} has missing or non-finite values for {key} {listed} ({unusable.sum()} of "
                     f"{len(self)} rows of {self.source}); correct the values, or {remedy}"
                 )
-            rows = ", ".join(map(str, self.row[unusable][:5])) + (", ..." if unusable.sum() > 5 else "")
             raise InputError(
-                f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} rows "
-                f"(row {rows}); correct the values, or {remedy}"
+                f"{self.source}: column {source!r} has missing or non-finite values in {unusable.sum()} of {len(self)} "
+                f"rows ({rows_text(self.row[unusable].tolist())}); correct the values, or {remedy}"
             )
         return numbers
 
@@ -175,11 +175,12 @@ class SourceTable:
         if (missing := column.isna().to_numpy()).any():
             first = int(np.flatnonzero(missing)[0])
             raise InputError(
-                f"{self.cell(first, names)}: the label is missing ({missing.sum()} missing labels in total); add the "
+                f"{self.cell(first, names)}: the label is missing (in {missing.sum()} of {len(self)} rows); add the "
                 "label, or rename labels that count as missing, such as NA, None and null"
             )
         if pd.api.types.is_float_dtype(column):
-            # A label must not depend on other rows, but pandas stores 26 as 26.0 if another row is empty or has 0.9.
+            # A label must not depend on other rows, but pandas stores 26 as 26.0 if another row is empty or contains
+            # 0.9.
             return column.astype(str).str.removesuffix(".0").to_numpy(dtype=np.str_)
         return column.astype(str).to_numpy(dtype=np.str_)
 
@@ -187,8 +188,8 @@ class SourceTable:
         """Positions [rows, 3], [m], in the scene frame, from three numbers or columns; `end` is "tx" or "rx".
 
         Raises:
-            InputError: There are not three coordinates, or a column is missing, not numeric, or named as longitude or
-                latitude.
+            InputError: The number of coordinates is not three, or a column is missing, not numeric, or named as
+                longitude or latitude.
         """
         if isinstance(coordinates, str) or len(coordinates) != 3:
             raise InputError(f"{end} = {coordinates!r}: must be x, y and z, each a number [m] or a column")

@@ -30,10 +30,10 @@ from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import as_path, exists
 
 MAX_UNPACKED: Final = 2**28
-"""Largest unpacked size of a workbook [bytes]."""
+"""Maximum unpacked size of a workbook [bytes]."""
 
 MAX_CELLS: Final = 10_000_000
-"""Largest number of cells in a sheet."""
+"""Maximum number of cells in a sheet."""
 
 _Cells = tuple[Any, ...]
 _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
@@ -42,9 +42,9 @@ _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 def sheet_text(path: Path) -> tuple[list[int], str]:
     """Read the first sheet of a workbook as CSV text, with the row number of each row that is not blank.
 
-    A formula is replaced by its last computed value. Without such a value, the formula remains text, which is refused
-    in a column of numbers. The first of several merged cells contains the value, and the other cells are empty. The
-    header, which is the first row, determines the columns.
+    A formula is replaced by its last computed value. If there is no computed value, the formula remains text, which is
+    rejected in a column of numbers. The first of several merged cells contains the value, and the other cells are
+    empty. The header, which is the first row, determines the columns.
 
     Raises:
         InputError: The file is not a workbook, contains no worksheet, is too large, or has a value in a column without
@@ -76,8 +76,8 @@ def _check_archive(path: Path) -> bool:
         size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_UNPACKED:
             raise InputError(
-                f"{path}: {size / 2**20:,.0f} MiB unpacked, must be at most {MAX_UNPACKED // 2**20} MiB; save the "
-                "sheet as CSV"
+                f"{path}: {size / 2**20:,.0f} MiB unpacked, more than the limit of {MAX_UNPACKED // 2**20} MiB; save "
+                "the sheet as CSV"
             )
         sheets = [archive.read(name) for name in archive.namelist() if name.startswith("xl/worksheets/")]
     for sheet in sheets:
@@ -86,7 +86,7 @@ def _check_archive(path: Path) -> bool:
 
 
 def _check_row_order(path: Path, sheet: bytes) -> None:
-    """Refuse rows out of order, because openpyxl drops repeated rows and takes hours to fill gaps."""
+    """Reject rows that are out of order, because openpyxl drops repeated rows and takes hours to fill gaps."""
     previous = 0
     for text in _ROW.findall(sheet):
         number = int(text) if text.isdigit() and len(text) < 10 else 0
@@ -100,7 +100,7 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
 
 
 def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
-    """Number and cells, up to the last value, of each row that is not blank; cells are computed values or formulas."""
+    """Yield the number and the cells (computed values or formulas) of each non-blank row, up to its last value."""
     import openpyxl
 
     # The file is opened here because openpyxl does not close files that it cannot read.
@@ -117,7 +117,9 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, _Cells]]:
             length = next((index for index in range(len(cells), 0, -1) if _has_value(cells[index - 1])), 0)
             count += length
             if count > MAX_CELLS:
-                raise InputError(f"{path}: more than {MAX_CELLS:,} cells; save the sheet as CSV or Parquet")
+                raise InputError(
+                    f"{path}: the sheet has more than {MAX_CELLS:,} cells; save the sheet as CSV or Parquet"
+                )
             if length:
                 yield number, cells[:length]
 
@@ -155,19 +157,19 @@ def _has_value(cell: Any) -> bool:
 
 
 LARGEST_ROW_GROUP: Final = 2**30
-"""Largest decompressed size of a row group or piece of a Parquet file that is read in pieces [bytes]."""
+"""Maximum decompressed size of a row group or piece of a Parquet file that is read in pieces [bytes]."""
 
 LARGEST_TABLE: Final = 2 * LARGEST_ROW_GROUP
-"""Largest decompressed size of a Parquet file that is read as a whole [bytes]; pandas requires up to twice this
+"""Maximum decompressed size of a Parquet file that is read as a whole [bytes]; pandas requires up to twice this
 memory."""
 
 DECODING_MEMORY: Final = 2 * LARGEST_TABLE
-"""Limit of the address space of the process that first decodes a Parquet file [bytes]."""
+"""Limit on the address space of the process that first decodes a Parquet file [bytes]."""
 
 PIECE_ROWS: Final = 100_000
-"""Largest number of rows of a Parquet file that are read together."""
+"""Maximum number of rows of a Parquet file that are read together."""
 
-# Both programs import pyarrow without NumPy, which is not needed here: a process takes 0.21 s instead of 0.39 s.
+# Both programs import pyarrow without NumPy, which they do not need. A process then takes 0.21 s instead of 0.39 s.
 _DECODE: Final = """
 sys.modules["numpy"] = None
 from pyarrow import parquet
@@ -180,7 +182,7 @@ try:
             if size > {limit}:
                 raise MemoryError
 except MemoryError:
-    refuse("takes more memory than it declares; export it again")
+    refuse("the content takes more memory than the file declares; export the file again")
 except Exception as error:
     refuse("not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
 """
@@ -203,10 +205,10 @@ _decoded: Final[set[tuple[str | int, ...]]] = set()
 
 
 def read_table(path: str | Path) -> SourceTable:
-    """Read a .csv, .txt, .tsv, .dat or .parquet file, or the first sheet of an .xlsx file, without blank lines.
+    """Read a .csv, .txt, .tsv, .dat or .parquet file, or the first sheet of an .xlsx file. Blank lines are skipped.
 
     The columns of a text file are separated by commas, semicolons, tabs or spaces. If the separator is not a comma,
-    numbers can have decimal commas. See `parse_text` for the lines that are skipped.
+    numbers can have decimal commas. See `parse_text` for other lines that are skipped.
 
     Raises:
         InputError: The file does not exist, has a different extension, or is empty or malformed. The library that reads
@@ -223,8 +225,8 @@ def read_table(path: str | Path) -> SourceTable:
         case ".xlsx":
             numbers, text = sheet_text(path)
             table = parse_text(path, text, ",")
-            # Line numbers in the text also count line breaks within cells; row numbers in the sheet count blank rows.
-            # The header, units and lines above it come first, so the rows of the table are the last rows of the sheet.
+            # Line numbers in the text include line breaks within cells, whereas row numbers in the sheet include blank
+            # rows. The header, the units and any lines above the header come first, so the table ends with the sheet.
             table = replace(table, row=np.array(numbers[len(numbers) - len(table) :], dtype=np.int64))
         case suffix:
             raise InputError(
@@ -238,7 +240,7 @@ def read_table(path: str | Path) -> SourceTable:
 @final
 @dataclass(frozen=True, eq=False)
 class PiecedTable:
-    """A table that is read in pieces, so a large Parquet file is never loaded entirely.
+    """A table that is read in pieces, so that a large Parquet file is never loaded entirely.
 
     Attributes:
         source: Name of the file.
@@ -255,7 +257,7 @@ class PiecedTable:
         """Open a CSV, Parquet or Excel file. CSV and Excel files are read immediately.
 
         Raises:
-            InputError: As for `read_table`.
+            InputError: The file has a fault described in `read_table`.
         """
         path = Path(path)
         if path.suffix.lower() != ".parquet" or not exists(path):
@@ -288,8 +290,8 @@ class PiecedTable:
             integers_with_gaps, start = _integer_columns_with_gaps(file), 0
             batches = file.iter_batches(batch_size=min(size, PIECE_ROWS))
             while (frame := _next_frame(path, batches)) is not None:
-                # NumPy integers cannot be missing, so pandas reads an integer column as float in pieces with gaps. The
-                # other pieces are converted here.
+                # NumPy integers cannot be missing, so pandas reads an integer column as float in pieces with gaps.
+                # Integer columns in the other pieces are converted here.
                 numpy_columns = [
                     name
                     for name in integers_with_gaps
@@ -315,7 +317,7 @@ def _read_parquet(path: Path) -> SourceTable:
 
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
-    """The declared size of row groups [bytes], which is checked because kilobytes can decompress to gigabytes.
+    """Check and return the declared size of row groups [bytes], because kilobytes can decompress to gigabytes.
 
     Raises:
         InputError: The size exceeds the limit or the available memory.
@@ -328,18 +330,19 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int
     )
     if size > min(limit, available_memory()):
         raise InputError(
-            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, more than the limit of {limit / 2**30:g} GiB "
-            "or the free memory; keep only the required columns and rows, or write smaller row groups"
+            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, which exceeds the limit of "
+            f"{limit / 2**30:g} GiB or the free memory; keep only the required columns and rows, or "
+            "write smaller row groups"
         )
     return size
 
 
 def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
-    """Decode a Parquet file in a process with limits, because its content can be larger than declared.
+    """Decode a Parquet file in a separate process with limits, because the content can be larger than declared.
 
-    Pages can be larger than declared, and rows can repeat one text. `size` is the declared size, and `limit` is the
-    largest size of the rows in memory, both in bytes. The limit applies to the table if `whole`, and otherwise to each
-    piece.
+    Pages can be larger than declared, and many rows can repeat one text. `size` is the declared size, and `limit` is
+    the maximum size of the rows in memory, both in bytes. The limit applies to the table if `whole`, and otherwise to
+    each piece.
 
     Raises:
         InputError: The file requires too much memory or time, or is damaged.
@@ -349,7 +352,7 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
 
 
 def _run_elsewhere(path: Path, code: str, size: int) -> None:
-    """Run a program on a file in a process with limits, once per program and state of the file.
+    """Run a program on a file in a separate process with limits, once per program and state of the file.
 
     Raises:
         InputError: The file requires too much memory or time, or is damaged.
@@ -374,7 +377,7 @@ def _run_elsewhere(path: Path, code: str, size: int) -> None:
 def _open_parquet(path: Path) -> Any:
     from pyarrow import parquet
 
-    # The library terminates the process if damaged metadata contradicts itself.
+    # If the metadata is damaged and contradicts itself, the library terminates the process.
     _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
         # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.
@@ -392,7 +395,7 @@ def _next_frame(path: Path, batches: Iterator[Any]) -> Any:
 
 
 def with_index_columns(frame: pd.DataFrame) -> pd.DataFrame:
-    """A table whose named index levels are columns and whose rows are numbered; unnamed levels are dropped.
+    """Convert named index levels to columns, drop unnamed levels, and number the rows.
 
     Example:
         >>> with_index_columns(pd.DataFrame({"time": [7, 9], "x": [1.0, 2.0]}).set_index("time"))
@@ -406,7 +409,7 @@ def with_index_columns(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_decimals(frame: pd.DataFrame) -> pd.DataFrame:
-    """A table with floats instead of the decimal numbers of database exports, which pandas stores as objects."""
+    """Convert the decimal numbers of database exports, which pandas stores as objects, to floats."""
     names = [name for name in frame if pd.api.types.infer_dtype(frame[name], skipna=True) == "decimal"]
     return frame.astype(dict.fromkeys(names, np.float64))
 

@@ -20,16 +20,16 @@ from calibray.measurements.selection import comparison, naming_column, repeated_
 from calibray.measurements.source_table import SourceTable
 
 MAX_DEVICES: Final = 12
-"""Largest number of receiving devices. A column with more values probably contains a different quantity, such as a
+"""Maximum number of receiving devices. A column with more values probably contains a different quantity, such as a
 location."""
 
 
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
     """Find the columns of a wide table, and the transmitter of each column.
 
-    The names of these columns differ only in the name of the transmitter, which is delimited by separators. If there
-    are several quantities, received power or path loss is chosen. The result is empty if there are fewer than two such
-    columns.
+    The names of these columns differ only in the name of the transmitter, which is delimited by separators. If the
+    table contains several quantities, the columns of received power or path loss are chosen. The result is empty if
+    fewer than two columns qualify.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
@@ -37,7 +37,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
         >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
         ['A RSS', 'B RSS']
     """
-    # Columns by the remainder of their name, such as " RSS(dBm)" in "AP1 RSS(dBm)".
+    # Columns, grouped by the rest of their name, such as " RSS(dBm)" in "AP1 RSS(dBm)".
     families: dict[tuple[str, str], dict[str, str]] = {}
     for name in transmitters:
         pattern = re.compile(rf"(|.*[^a-z0-9]){re.escape(name.lower())}(|[^a-z0-9].*)")
@@ -69,14 +69,14 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
     """
     column, name = next(iter(columns.items()))
     before, _, after = column.lower().rpartition(name.lower())
-    # If the names have no other words, unknown columns differ from known ones only in digits.
+    # If column names contain only the transmitter, unknown columns differ from known columns only in digits.
     middle = r"[^ _]+" if before + after else re.sub(r"\d+", r"\\d+", re.escape(name.lower()))
     pattern = re.compile(rf"{re.escape(before)}{middle}{re.escape(after)}")
     return [str(other) for other in frame if other not in columns and pattern.fullmatch(str(other).lower())]
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
-    """Name for the column into which the columns of a wide table are combined, based on a word in all column names.
+    """Name for the combined column of a wide table, based on a word that all column names share.
 
     Example:
         >>> name_melted_values(["RSS AP1", "RSS AP2"])
@@ -88,11 +88,11 @@ def name_melted_values(columns: Iterable[str]) -> str:
 
 
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """Find the column with the name of the transmitter in both tables; None if there is no such column.
+    """Find the column that contains transmitter names in both tables; None if there is no such column.
 
-    Its values in the table of transmitters are distinct. The first such column that contains all values of the links is
-    chosen. Otherwise, it is the first such column whose name indicates a transmitter and that shares a value with the
-    links.
+    The values of this column are distinct in the table of transmitters. The first column that contains all values of
+    the links is chosen. If there is none, the first column is chosen whose name indicates a transmitter and that shares
+    a value with the links.
     """
     partial = None
     for name in transmitters:
@@ -131,7 +131,7 @@ def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[st
 def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
     """Find the column of transmitter names in a table that also contains the transmitter positions.
 
-    Each name has a single position.
+    Each name must have a single position.
 
     Example:
         >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
@@ -168,8 +168,8 @@ def find_transmitter_names(transmitters: SourceTable) -> list[str]:
     repeated = "" if fullest is None else repeated_label(transmitters, fullest)
     raise InputError(
         repeated
-        or f"{transmitters.source}: no column contains distinct names ({', '.join(map(str, frame))}); name such a "
-        "column 'transmitter'"
+        or f"{transmitters.source}: none of the columns {', '.join(map(str, frame))} contains distinct names; "
+        "name a column with distinct names 'transmitter'"
     )
 
 
@@ -189,7 +189,7 @@ def find_devices(frame: pd.DataFrame) -> list[str]:
 
 
 LARGEST_ANGLE: Final = {"azimuth_deg": 360.0, "downtilt_deg": 90.0, "electrical_downtilt_deg": 90.0}
-"""Largest plausible angle in a column [deg], by the column's key in ``[links.tx_antenna]``."""
+"""Largest plausible angle in a column [deg], by the key of the column in ``[links.tx_antenna]``."""
 
 POWERS: Final = (-30.0, 100.0)
 """Smallest and largest plausible transmitted power in a column [dBm]."""
@@ -225,20 +225,22 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
 
 
 def lacks_angle(column: pd.Series, may_be_empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask [rows] of the cells without a number, except empty cells in rows where a cell may be empty [rows]."""
+    """Mask [rows] of cells without a number, except empty cells in rows where `may_be_empty` [rows] is true."""
     lacking = pd.to_numeric(column, errors="coerce").isna() & ~(column.isna() & may_be_empty)
     return lacking.to_numpy(bool)
 
 
 def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.bool_]) -> str:
-    """The reason why a column cannot contain the angles of the transmitters; empty if it can.
+    """The reason why a column cannot contain the angles of the transmitters; empty if the column can.
 
     `lacking` is the result of `lacks_angle`.
     """
     values = pd.to_numeric(frame[column], errors="coerce")
     missing = len(frame) if values.isna().all() else int(lacking.sum())
     if missing or column not in numeric_columns(frame):
-        return f"{missing or len(frame)} of {len(frame)} rows contain no number; add the numbers and state the key"
+        return (
+            f"{missing or len(frame)} of {len(frame)} rows have no number; add the numbers and state the key"
+        )
     if values.abs().max() > LARGEST_ANGLE[key]:
         return f"the value {values.abs().max():g} is not an angle in degrees"
     return ""
@@ -247,7 +249,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.boo
 def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | None:
     """Find the column with the names of antenna models or files.
 
-    Of several columns, the one with the most `known` names is chosen.
+    If several columns qualify, the column with the most `known` names is chosen.
     """
     texts = [str(name) for name in frame if not pd.api.types.is_bool_dtype(frame[name])]
     names = [name for name in texts if matches(name, "antenna") and name not in numeric_columns(frame)]
@@ -273,7 +275,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Find the column of the EIRP, or else of the transmitted power [dBm], by its key in ``[links]``."""
+    """Find the column of EIRP or, failing that, of transmitted power [dBm]; the key is that in ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)
