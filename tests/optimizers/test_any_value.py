@@ -144,7 +144,9 @@ def test_residuals_whose_mean_square_contradicts_the_value_are_refused(method, t
     if not together:
         optimizer.tell(*(part[:1] for part in evaluations))
         evaluations = tuple(part[1:] for part in evaluations)
-    with pytest.raises(InputError, match="the mean square must rise with the value: pass deviance residuals"):
+    with pytest.raises(
+        InputError, match="the mean square must increase with the value: pass deviance residuals"
+    ):
         optimizer.tell(*evaluations)
     assert optimizer.evaluations == 1 - together
 

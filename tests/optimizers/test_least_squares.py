@@ -128,7 +128,7 @@ def test_an_impossible_catch_up_is_refused(catch_up):
 
 @pytest.mark.parametrize("start", ["abc", [["a", 1.0]], {"a": 1.0}])
 def test_a_start_that_is_not_numbers_is_refused(start):
-    with pytest.raises(InputError, match=r"x0 = .*: must be numbers, one for each parameter"):
+    with pytest.raises(InputError, match=r"x0 = .*; it must contain one number for each parameter"):
         LeastSquares([0.0], [1.0], x0=start)
 
 
@@ -189,7 +189,7 @@ def test_duplicate_starts_are_merged():
     ("x0", "message"),
     [
         ([1.0], r"x0 has shape \(1,\); it must be \[2\] or \[k, 2\]"),
-        ([[0.0, 3.0]], r"x0\[0, 1\] = 3 lies outside its bounds \[-2, 2\]; move the start or widen"),
+        ([[0.0, 3.0]], r"x0\[0, 1\] = 3 lies outside its bounds \[-2, 2\]; move the starting point or widen"),
         ([0.0, np.nan], r"x0\[0, 1\] = nan"),
     ],
 )

@@ -1,7 +1,7 @@
-"""Seeded ask/tell optimizers that minimise over a box; they use NumPy arrays and do not depend on the radio model.
+"""Seeded ask/tell optimizers that minimise a function over a box; they do not depend on the radio model.
 
-Every class is an `Optimizer`. Each class states which parts of an evaluation it uses, how it respects a budget and
-whether it uses starting points. `METHODS` lists the classes by their names in study files, and `make` constructs an
+Every class is an `Optimizer`. Each class declares which parts of an evaluation it uses, how it respects a budget, and
+whether it uses starting points. `METHODS` lists the classes by their names in study files; `make` constructs an
 optimizer. Optional libraries are imported only when a class that needs them is constructed.
 """
 
@@ -77,11 +77,11 @@ LABELS: Final = {
 }
 
 NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
-"""Constructor arguments that follow from the rest of the study; `method.options` cannot contain them."""
+"""Constructor arguments that are set by other parts of the study, so `method.options` must not contain them."""
 
 
 def method(name: str) -> type[Optimizer]:
-    """The class of a named method; it states which parts of an evaluation and which schedule the method uses.
+    """The class of a named method, which declares the parts of an evaluation and the schedule that the method uses.
 
     Raises:
         InputError: There is no such method.
@@ -96,7 +96,7 @@ def method(name: str) -> type[Optimizer]:
 
 
 def label(name: str) -> str:
-    """The label of a method, or of a method with a budget (`METHOD@CALLS`), in tables and figures.
+    """The label in tables and figures of a method, or of a method with a budget (`METHOD@CALLS`).
 
     Example:
         >>> label("gwo@600")
@@ -120,19 +120,19 @@ def make(
     cheap_model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
-    """Construct the optimizer of a named method; arguments that the method does not use are ignored.
+    """Construct the optimizer for a named method; arguments that the method does not use are ignored.
 
     Args:
         name: A method of `METHODS`.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed.
-        budget: Number of evaluations; the method's default if None. Methods that stop by themselves ignore the budget.
+        budget: Number of evaluations; the method's default if None. Methods that stop on their own ignore the budget.
         start: Starting points, [d] or [k, d], for methods that use them.
-        starts: Number of starting points that these methods add to `start`; the method's default if None.
-        objective: Function that maps residuals to the objective, for methods that use residuals; the root mean square
-            if None.
-        cheap_model: A cheap model of the engine, for methods that use one.
+        starts: Number of further starting points that the method adds to `start`; the method's default if None.
+        objective: Function that maps residuals to the objective, for methods that use residuals; root mean square if
+            None.
+        cheap_model: A cheap model of the engine, for methods that use a cheap model.
         options: Settings of the method, which override the arguments above.
 
     Raises:

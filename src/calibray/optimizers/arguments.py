@@ -1,4 +1,4 @@
-"""Checks of constructor arguments, and the search box with its map to and from the unit cube."""
+"""Checks of constructor arguments, and the search box with its mapping to and from the unit cube."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Box:
         if low.ndim != 1 or low.shape != high.shape or low.size == 0:
             raise InputError(
                 f"lower has shape {low.shape} and upper {high.shape}; "
-                "both must be vectors [d] with one entry for each of d >= 1 parameters"
+                "both must be vectors with one entry for each parameter"
             )
         for number, (a, b) in enumerate(zip(low, high, strict=True)):
             if not (np.isfinite(a) and np.isfinite(b) and a < b):
@@ -96,7 +96,7 @@ class Box:
 
     @property
     def width(self) -> NDArray[np.float64]:
-        """Upper minus lower bounds [d]."""
+        """Upper bounds minus lower bounds [d]."""
         return self.upper - self.lower
 
     def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:

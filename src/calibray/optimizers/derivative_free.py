@@ -1,17 +1,17 @@
 """Derivative-free least squares: POUNDERS, and Gauss-Newton with finite differences.
 
-Both are local methods. They start in the middle of the box, or at the best point already passed to `tell`. They restart
-at random points if they converge before their budget is used up.
+Both are local methods. The first search starts in the middle of the box, or at the best point already passed to `tell`.
+If a search converges before the budget is used up, the next search starts at a random point.
 
 POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
-in Optimization with Engineering Applications, SIAM (2017), ch. 40. It is implemented here because the authors' package
-IBCDFO needs a solver (MINQ) that is not in any package index. Each residual is modelled by the quadratic of least
-curvature through evaluated points near the best one. The sum of squares of these models, to second order, is minimised
-in a box-shaped trust region. Points that span all directions within the region are chosen first, because they make the
-models fully linear. If a direction is missing and the step failed, a point along this direction is evaluated before the
-region shrinks.
+in Optimization with Engineering Applications, SIAM (2017), ch. 40. POUNDERS is implemented here because the authors'
+package IBCDFO needs a solver (MINQ) that is not in any package index. Each residual is modelled by the quadratic of
+least curvature that interpolates evaluated points near the best point. The sum of the squared models, to second order,
+is minimised in a box-shaped trust region. Points that span all directions within the region are chosen first, because
+they make the models fully linear. If a direction is missing and the step failed, a point along this direction is
+evaluated before the region shrinks.
 
-Gauss-Newton is the usual choice of users who have a least-squares solver but no derivatives. Every accepted point
+Gauss-Newton is the usual choice if a least-squares solver is available but derivatives are not. Every accepted point
 requires one further evaluation per parameter, all in one batch. `descent.py` computes the steps.
 """
 
@@ -30,19 +30,19 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
-"""Largest distances of spanning points, in units of radius x sqrt(d), for a fully linear model and for any model."""
+"""Maximum distances of spanning points for a fully linear model and for any model, in units of radius x sqrt(d)."""
 
 NEW_DIRECTION: Final = 1e-3
-"""Smallest component along a new direction, divided by max(distance, radius), with which a point spans it (theta_1)."""
+"""Smallest component of a spanning point along a new direction, divided by max(distance, radius) (theta_1)."""
 
 INDEPENDENT: Final = 1e-3
-"""Smallest pivot (see `_pivot`) at which a further point is included in the model (theta_2)."""
+"""Smallest pivot (see `_pivot`) for which a further point is included in the model (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""A step that achieves this share of the predicted decrease is successful; the trust region then does not shrink."""
+"""Share of the predicted decrease that a successful step achieves; after such a step, the region does not shrink."""
 
 LARGEST: Final = 0.5
-"""Largest trust-region radius, as a share of the box width."""
+"""Maximum trust-region radius, as a fraction of the box width."""
 
 
 @final
@@ -52,8 +52,8 @@ class POUNDERS(Optimizer):
     Args:
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
-        radius: Initial trust-region radius, as a share of the box width.
-        tolerance: Trust-region radius at which a search has converged, as a share of the box width.
+        radius: Initial trust-region radius, as a fraction of the box width.
+        tolerance: Trust-region radius at which a search has converged, as a fraction of the box width.
 
     Raises:
         InputError: An argument is out of range.
@@ -83,7 +83,7 @@ class POUNDERS(Optimizer):
 def _searches(
     local: Callable[..., Search], seed: int, budget: int, *settings: float
 ) -> Callable[[Archive], Search]:
-    """Make a function that runs local searches from successive starting points, within the budget."""
+    """Return a function that runs local searches from successive starting points until the budget is used up."""
     rng = np.random.default_rng(whole("seed", seed, at_least=0))
 
     def search(archive: Archive) -> Search:
@@ -103,12 +103,12 @@ class _Points(NamedTuple):
 
     @property
     def value(self) -> NDArray[np.float64]:
-        """Half the sum of squared residuals of each point [n]."""
+        """Half the sum of squared residuals at each point [n]."""
         return 0.5 * np.sum(self.residuals**2, axis=1)
 
 
 def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: float) -> Search:
-    """Run one local search with trust-region radii from `radius` down to `last`; yields candidates [n, d]."""
+    """Run one local search with trust-region radii from `radius` down to `last`, and yield candidates [n, d]."""
     box, d = archive.box, len(start)
 
     def evaluated(
@@ -119,14 +119,15 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         both = [new] if points is None else [points, new]
         return _Points(*(np.concatenate(part) for part in zip(*both, strict=True)))
 
-    # The first points lie towards the farther face along each axis.
+    # The first points are displaced towards the farther face along each axis.
     side = np.where(start <= 0.5, radius, -radius)
     points = yield from evaluated(None, np.vstack([start, start + np.diag(side)]))
     while radius > last:
         best = int(np.argmin(points.value))
         centre = points.unit[best]
         chosen, missing = _spanning(points, best, radius)
-        # A model needs d points in addition to the best one; distant points are used if there are too few near ones.
+        # A model needs d points in addition to the best point. If there are too few near points, distant points are
+        # used.
         if missing is None or len(chosen) == d:
             step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
             if predicted > 0 and np.abs(step).max() > 1e-3 * last:
@@ -144,10 +145,10 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
 
 
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
-    """Indices of points that span the directions around the best point, and the missing directions [k, d].
+    """Find points that span the directions around the best point, and the directions that no point spans.
 
-    A direction is missing if nearby points do not span it; the model is then not fully linear. The second value is None
-    if no direction is missing.
+    Returns the indices of the points, and the missing directions [k, d]. A direction is missing if nearby points do not
+    span it; the model is then not fully linear. The second return value is None if no direction is missing.
     """
     offset = (points.unit - points.unit[best]) / radius
     distance = np.linalg.norm(offset, axis=1)
@@ -158,7 +159,7 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
         for index in range(len(offset) - 1, -1, -1):
             if index == best or index in chosen or distance[index] > reach * np.sqrt(offset.shape[1]):
                 continue
-            # Gram-Schmidt: the component along directions that the chosen points do not span.
+            # Gram-Schmidt gives the component along directions that the chosen points do not span.
             rest = offset[index] - basis.T @ (basis @ offset[index])
             if np.linalg.norm(rest) >= NEW_DIRECTION * max(distance[index], 1.0):
                 chosen.append(index)
@@ -188,15 +189,15 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 
 
 def _pivot(offset: NDArray[np.float64]) -> float:
-    """Smallest singular value of the quadratic kernel, projected onto the complement of the linear functions."""
+    """Smallest singular value of the quadratic kernel projected onto the complement of the linear functions."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
-    # Weights of the points for which the weighted sum of every linear function is zero.
+    # Columns of q are weights of the points for which the weighted sum of every linear function is zero.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
     return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])
 
 
 def _quadratic(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The kernel (x . y)^2 / 2, whose interpolant has the Hessian with the smallest Frobenius norm."""
+    """The kernel (x . y)^2 / 2, for which the Hessian of the interpolant has the smallest Frobenius norm."""
     return 0.5 * (offset @ offset.T) ** 2
 
 
@@ -207,7 +208,7 @@ def _step(
     offset = (points.unit[kept] - points.unit[best]) / radius
     count, d = offset.shape
     plane = np.hstack([np.ones((count, 1)), offset])
-    # Interpolation with the least curvature; the unknowns are one multiplier per point, the constant and the slopes.
+    # Least-curvature interpolation. The unknowns are one multiplier per point, the constant and the slopes.
     system = np.block([[_quadratic(offset), plane], [plane.T, np.zeros((d + 1, d + 1))]])
     side = np.vstack([points.residuals[kept], np.zeros((d + 1, points.residuals.shape[1]))])
     solved = np.linalg.lstsq(system, side, rcond=1e-12)[0]
@@ -234,11 +235,11 @@ def _step(
 def improving_point(
     centre: NDArray[np.float64], missing: NDArray[np.float64], radius: float
 ) -> NDArray[np.float64]:
-    """A point of the unit cube [d] that improves the model around `centre` [d].
+    """Choose a point in the unit cube [d] that improves the model around `centre` [d].
 
-    The point lies within the radius along a missing direction [k, d], opposite to a missing direction, or along an axis
-    towards the farther face. Of these points, the one with the largest component along missing directions is chosen. In
-    a corner, all missing directions can lead out of the cube.
+    The candidates lie within the radius along a missing direction [k, d], opposite to a missing direction, or along an
+    axis towards the farther face. The candidate with the largest component along missing directions is chosen. Axes are
+    included because, in a corner, all missing directions can lead out of the cube.
     """
     directions = np.vstack([missing, -missing, np.diag(np.where(centre <= 0.5, 1.0, -1.0))])
     edge = np.where(directions > 0, 1.0 - centre, centre)
@@ -256,8 +257,9 @@ class GaussNewton(Optimizer):
     Args:
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
-        step: Finite-difference step, as a share of the box width.
-        tolerance: Relative decrease in cost, or step as a share of the box width, below which a search has converged.
+        step: Finite-difference step, as a fraction of the box width.
+        tolerance: A search has converged if the relative decrease in cost, or the step as a fraction of the box width,
+            is below this tolerance.
 
     Raises:
         InputError: An argument is out of range.
@@ -285,14 +287,14 @@ class GaussNewton(Optimizer):
 
 
 def _newton(archive: Archive, start: NDArray[np.float64], step: float, tolerance: float) -> Search:
-    """Run one local search; yields candidates [n, d] in the box."""
+    """Run one local search, and yield candidates [n, d] in the box."""
     box, lowest = archive.box, np.inf
     descent = descend(start[None], 10**6, tolerance)
     unit = next(descent)
     while True:
         residuals = archive.imputed((yield box.from_unit(unit))).errors
         value, slope = float(np.sum(residuals**2)), np.zeros((*residuals.shape, unit.shape[1]))
-        if value < lowest:  # a rejected step needs no derivatives
+        if value < lowest:  # derivatives are not needed at a rejected step
             lowest = value
             moves = np.where(unit[0] <= 0.5, step, -step)
             moved = archive.imputed((yield box.from_unit(unit + np.diag(moves)))).errors

@@ -1,11 +1,12 @@
-"""Projected Levenberg-Marquardt from many starting points in parallel, for least squares in the unit cube.
+"""Projected Levenberg-Marquardt from many starting points in parallel, for least-squares problems in the unit cube.
 
 A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
-divided by the number of residuals. Components that would leave the cube are fixed at its face, and the system is solved
-again for the rest, until no component leaves the cube. The damping mu is updated from the gain ratio as in H. B.
-Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
+divided by the number of residuals. Components that would leave the cube are fixed at the face of the cube. The system
+is then solved again for the other components, until no component leaves the cube. The damping mu is updated from the
+gain ratio as in H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of
+Denmark).
 
-`descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` calls the engine, and
+`descend` is a generator, so the caller decides how points are evaluated. `least_squares.py` calls the engine, and
 `descend_all` calls a model.
 """
 
@@ -19,20 +20,20 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 INITIAL_DAMPING = 1e-3
-"""Initial mu, as a share of the largest diagonal element of H."""
+"""Initial mu, as a fraction of the largest diagonal element of H."""
 
 MERGE_DISTANCE = 1e-3
-"""Distance in the unit cube below which two searches are assumed to approach the same minimum."""
+"""Distance in the unit cube below which two searches are assumed to converge to the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]; a row with a residual that is
-not finite marks a failed evaluation.
+"""Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]. A row with a non-finite residual
+marks a failed evaluation.
 """
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Local searches in progress, with the quadratic model of each.
+    """Local searches in progress, with the quadratic model of each search.
 
     Attributes:
         unit: Current points in the unit cube [s, d].
@@ -53,17 +54,17 @@ class Starts:
     searches: NDArray[np.int64]
 
     def rows(self, keep: NDArray[np.bool_]) -> Starts:
-        """The searches where `keep` is True [s]."""
+        """The searches for which `keep` [s] is True."""
         return Starts(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
-    """Form the quadratic models at evaluated points [s, d] in the unit cube; a failed evaluation has infinite cost."""
+    """Form the quadratic models at evaluated points [s, d] in the unit cube. A failed evaluation has infinite cost."""
     r, j = evaluated
     failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
     links = r.shape[1]
-    # The cost is half the mean square, so its derivatives are means over the residuals too.
+    # The cost is half the mean square, so its derivatives are also means over the residuals.
     curvature = np.einsum("smi,smj->sij", j, j) / links
     largest = np.diagonal(curvature, axis1=1, axis2=2).max(axis=1)
     return Starts(
@@ -78,7 +79,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
 
 
 def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Steps [s, d] that stay inside the unit cube, and the decreases in cost that the models predict [s]."""
+    """Compute steps [s, d] that stay inside the unit cube, and the decreases in cost that the models predict [s]."""
     count, dimension = starts.unit.shape
     # The floor keeps the matrix non-singular if two parameters have the same effect and the damping is negligible.
     floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
@@ -88,7 +89,7 @@ def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float6
     step = np.zeros((count, dimension))
     free = np.ones((count, dimension), dtype=bool)
     for _ in range(dimension + 1):
-        # Fixed components keep their displacement: their rows become rows of the identity.
+        # Fixed components keep their displacement, so their rows become rows of the identity.
         matrix = np.where(free[:, :, None] & free[:, None, :], damped, np.eye(dimension))
         fixed = np.where(free, 0.0, step)
         side = np.where(free, -starts.gradient - np.einsum("sij,sj->si", damped, fixed), fixed)
@@ -98,8 +99,8 @@ def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float6
         if not outside.any():
             break
         free &= ~outside
-    # Fixing groups of components is a heuristic; the projected gradient step, which always descends, is the fallback.
-    # The trace is at least the largest curvature in any direction.
+    # Fixing groups of components is a heuristic, so the projected gradient step is the fallback. This step always
+    # decreases the cost of the model, because the trace is at least the largest curvature in any direction.
     bound = np.trace(damped, axis1=1, axis2=2)[:, None]
     gradient_step = np.clip(-starts.gradient / bound, low, high)
     better = _decrease(starts, gradient_step) > _decrease(starts, step)
@@ -131,10 +132,10 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 
 
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
-    """Find searches that are close to a better search and would only reach the same minimum.
+    """Merge searches that are close to a better search, because they would only reach the same minimum.
 
     Returns the moving searches, the settled searches, and a mask of the moving searches that can be dropped [s]. The
-    counts `searches` include the merged searches.
+    counts in `searches` include the merged searches.
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
     # Ties are broken by index, so exactly one of two close searches is better.
@@ -157,14 +158,14 @@ def descend(
     earlier: Starts | None = None,
     followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
-    """Search from all points [s, d] until each search has converged, merged with a better one, or been abandoned.
+    """Search from all points [s, d] until each search has converged, joined a better search, or been abandoned.
 
-    Each search takes at most `iterations` steps. It has converged if its model predicts a relative decrease in cost, or
-    a step, below `tolerance`. A search is abandoned if its cost exceeds the lowest one by more than `catch_up` times
-    its predicted decrease. A search that comes close to the end of a better search in `earlier` is merged with it. Only
-    the `followed` starting points with the lowest cost are used; all are used if None. Yields points to evaluate [s,
-    d]. Returns the earlier searches, then the searches that converged or were still moving at the end, and then the
-    abandoned searches.
+    Each search takes at most `iterations` steps. A search has converged if its model predicts a relative decrease in
+    cost, or a step, below `tolerance`. A search is abandoned if its cost exceeds the lowest cost by more than
+    `catch_up` times its predicted decrease. A search that comes close to the end of a better search in `earlier` is
+    merged with the better search. Only the `followed` starting points with the lowest costs are used; if `followed` is
+    None, all are used. The generator yields points to evaluate [s, d]. It returns the earlier searches, then the
+    searches that converged or were still moving at the end, and then the abandoned searches.
     """
     starts = begin(unit, (yield unit))
     # Searches do not start at failed evaluations.
@@ -197,7 +198,7 @@ def descend_all(
     iterations: int,
     tolerance: float,
 ) -> Starts:
-    """Descend from `unit` [s, d] on a model that returns residuals and their Jacobian; return the final searches."""
+    """Search from `unit` [s, d] on a model that returns residuals and their Jacobian, and return the final searches."""
     descent = descend(unit, iterations, tolerance)
     points = next(descent)
     while True:
@@ -208,7 +209,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep only the best of the searches that ended within `separation` of each other, and sort them by cost."""
+    """Keep only the best of the searches that ended within `separation` of each other; the result is sorted by cost."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

@@ -1,4 +1,4 @@
-"""The real evaluations of a run: the only source of leaders, memories, surrogates and results."""
+"""The engine evaluations of a run, which are the only source of leaders, memories, surrogates and results."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Function that maps residuals [n, m] to values [n]; a value must increase with the mean square of its residuals."""
+"""Function that maps residuals [n, m] to values [n]. The value must increase with the mean square of the residuals."""
 
 OBJECTIVE_TOLERANCE = 1e-4
-"""Largest accepted relative difference between a value and that computed from its residuals; allows for float32."""
+"""Maximum relative difference between a value and the objective of its residuals, which may be in single precision."""
 
 DECIMALS = 9
 """Number of decimals to which unit-cube coordinates are rounded before repeated points are merged."""
@@ -23,7 +23,7 @@ DECIMALS = 9
 
 @dataclass(frozen=True)
 class Best:
-    """The best real evaluation so far: the point [d] and its value, +inf if every evaluation failed."""
+    """The best evaluation so far: the point [d] and its value, which is +inf if every evaluation failed."""
 
     x: NDArray[np.float64]
     y: float
@@ -31,12 +31,12 @@ class Best:
 
 @dataclass(frozen=True)
 class Evaluations:
-    """Real evaluations; build them with `checked_evaluations`, which validates and copies them.
+    """Evaluations by the engine; `checked_evaluations` builds them from validated copies.
 
     Attributes:
         x: Points [n, d].
         y: Values [n], +inf for a failed evaluation.
-        residuals: Residuals [n, m], or None; their mean square increases with y.
+        residuals: Residuals [n, m], or None. Their mean square increases with y.
         jacobian: Derivatives of the residuals with respect to the parameters [n, m, d], or None.
     """
 
@@ -72,7 +72,7 @@ class Evaluations:
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
-        """Concatenate one or more sets of evaluations that have the same optional parts."""
+        """Concatenate one or more sets of evaluations with the same optional parts."""
 
         def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
             present = [array for array in arrays if array is not None]
@@ -87,7 +87,7 @@ class Evaluations:
 
 
 class Archive:
-    """All evaluations of a run, requested or not, in the order in which `tell` received them."""
+    """All evaluations of a run, whether requested or not, in the order in which `tell` received them."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
@@ -98,7 +98,7 @@ class Archive:
         return sum(len(part) for part in self._parts)
 
     def add(self, evaluations: Evaluations) -> None:
-        """Append checked evaluations; their Jacobians are not kept."""
+        """Append checked evaluations, without their Jacobians."""
         self._parts.append(Evaluations(evaluations.x, evaluations.y, evaluations.residuals))
         lowest = self._parts[-1].rows(np.argmin(evaluations.y, keepdims=True))
         if self._leading is None or lowest.y[0] < self._leading.y[0]:
@@ -121,12 +121,14 @@ class Archive:
             InputError: No evaluation has been passed to `tell` yet.
         """
         if self._leading is None:
-            raise InputError("no best point: there are no evaluations yet; call tell() first")
+            raise InputError(
+                "there is no best point, because there are no evaluations yet; call tell() first"
+            )
         return self._leading
 
     @property
     def lowest(self) -> float:
-        """Root mean square of the residuals of `leading`; +inf if all failed. `y` can have a different scale."""
+        """Root mean square of the residuals of `leading`, which can differ from `y`; +inf if all evaluations failed."""
         succeeded = self._leading is not None and np.isfinite(self._leading.y[0])
         return float(root_mean_square(self.leading.errors)[0]) if succeeded else np.inf
 
@@ -137,7 +139,7 @@ class Archive:
             InputError: No evaluation has been passed to `tell` yet.
         """
         if not self._parts:
-            raise InputError("the archive is empty; at least 1 evaluation is needed: call tell() first")
+            raise InputError("the archive contains no evaluations; call tell() first")
         self._parts = [Evaluations.joined(self._parts)]
         return self._parts[0]
 
@@ -156,9 +158,9 @@ class Archive:
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
     def imputed(self, evaluations: Evaluations) -> Evaluations:
-        """Give failed evaluations the value and residuals of the worst successful one, so that models avoid them.
+        """Assign failed evaluations the value and residuals of the worst successful one, so that models avoid them.
 
-        Both are zero if every evaluation so far has failed.
+        The value and the residuals are zero if every evaluation so far has failed.
         """
         run = self.all()
         failed, good = ~np.isfinite(evaluations.y), np.flatnonzero(np.isfinite(run.y))
@@ -179,7 +181,7 @@ def checked_evaluations(
     uses: frozenset[str],
     objective: Objective | None = None,
 ) -> Evaluations:
-    """Validate and copy evaluations: points x [n, d], values y [n], and the residuals and Jacobian in `parts`.
+    """Validate and copy evaluations: points x [n, d], values y [n], and the residuals and the Jacobian in `parts`.
 
     A value of +inf marks a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer
     does not use are checked and dropped. Values are compared with the objective of the residuals unless `objective` is
@@ -192,7 +194,8 @@ def checked_evaluations(
     points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
     if len(points) != len(values) or len(values) == 0:
         raise InputError(
-            f"x has {len(points)} rows and y {len(values)}; pass one value for each of n >= 1 points"
+            f"x has shape {points.shape} and y has shape {values.shape}; pass one value per "
+            "point, and at least one point"
         )
     _finite("x", points)
     for row, column in np.argwhere((points < box.lower) | (points > box.upper)):
@@ -200,7 +203,7 @@ def checked_evaluations(
             f"x[{row}, {column}] = {points[row, column]:g} lies outside its bounds "
             f"[{box.lower[column]:g}, {box.upper[column]:g}]; remove the point or widen the bounds"
         )
-    # The comparison is negated so that NaN is refused as well.
+    # The comparison is negated so that NaN is also rejected.
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
         raise InputError(f"y[{row}] = {values[row]}; it must be a number, or +inf for a failed evaluation")
     residuals, jacobian = parts["residuals"], parts["jacobian"]
@@ -213,7 +216,7 @@ def checked_evaluations(
     if errors is not None:
         _finite("residuals", errors, good)
         if errors.shape[1] == 0:
-            raise InputError("residuals has 0 columns; at least 1 link is needed")
+            raise InputError("residuals has 0 columns; at least one link is required")
         if objective is not None:
             _check_value(values, errors, good, objective)
     if jacobian is not None:
@@ -226,10 +229,10 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that values rise with the mean square of the residuals, for the new evaluations and the best one so far.
+    """Check that values increase with the mean square of residuals, for new evaluations and the best evaluation so far.
 
     Raises:
-        InputError: An evaluation has a lower value than another one, but a higher mean square.
+        InputError: An evaluation has a lower value than another evaluation, but a higher mean square.
     """
     if len(archive):
         without_jacobian = Evaluations(evaluations.x, evaluations.y, evaluations.residuals)
@@ -238,7 +241,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
     size = root_mean_square(evaluations.errors)
     order = np.argsort(size, kind="stable")
     value, size = evaluations.y[order], size[order]
-    # With evaluations sorted by mean square, no value may be below an earlier one.
+    # If evaluations are sorted by mean square, no value may be below an earlier value.
     highest = np.maximum.accumulate(value)
     slack = OBJECTIVE_TOLERANCE * np.abs(value) + 1e-9
     for row in np.flatnonzero(highest > value + slack):
@@ -246,7 +249,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
         if size[row] > (1.0 + OBJECTIVE_TOLERANCE) * size[before] + 1e-9:
             raise InputError(
                 f"y = {value[row]:g} with sqrt(mean(residuals**2)) = {size[row]:g}, but y = {value[before]:g} "
-                f"with {size[before]:g}; the mean square must rise with the value: pass deviance residuals"
+                f"with {size[before]:g}; the mean square must increase with the value: pass deviance residuals"
             )
 
 
@@ -260,7 +263,7 @@ def merge_repeated(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Merge repeated points [n, d] in the unit cube into distinct points [k, d] with mean values [k, ...]."""
     points, group = np.unique(np.round(unit, DECIMALS), axis=0, return_inverse=True)
-    # Each row averages the repeats of one point.
+    # Each row contains the weights that average the repeats of one point.
     share = (np.arange(len(points))[:, None] == group) / np.bincount(group)[:, None]
     return points, share @ values
 

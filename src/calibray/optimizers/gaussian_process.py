@@ -1,9 +1,9 @@
 """Bayesian optimization: a Gaussian process models the value, and the expected improvement selects candidates.
 
 This method models one value, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
-with a maximin Latin hypercube. Every further candidate maximises the log expected improvement (D. R. Jones, M.
-Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm as in S. Ament et al., NeurIPS 2023,
-arXiv:2310.20708). A failed evaluation enters the model with the worst successful value.
+with a maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R.
+Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; for the logarithm, see S. Ament et al., NeurIPS
+2023, arXiv:2310.20708). In the model, a failed evaluation has the worst successful value.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from calibray.optimizers.regression import Kriging, fit, solve
 from calibray.optimizers.sampling import SEPARATION, distance_to_nearest, draw_around, maximin_design
 
 CANDIDATES = 300
-"""Number of candidates drawn over the whole box, and number drawn around the best points."""
+"""Number of candidates drawn over the whole box, and also the number drawn around the best points."""
 
 
 @final
 class GaussianProcess(Optimizer):
-    """Bayesian optimization. Uses only objective values; 20 d evaluations by default.
+    """Bayesian optimization. Uses only objective values; takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
@@ -64,11 +64,11 @@ class GaussianProcess(Optimizer):
             unit = self.box.to_unit(evaluated.x)
             points, values = merge_repeated(unit, evaluated.y[:, None])
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0)) == d
-            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # not enough for a model
+            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # too little data for a model
                 x = self._rng.random(d)
             else:
                 kernel = None if model is None else model.process.kernel
-                # The kernel is fitted at every step up to 40 points, and at every tenth step after that.
+                # The kernel is fitted at every step up to 40 points, and at every tenth step afterwards.
                 if kernel is None or len(points) <= 40 or turn % 10 == 0:
                     model = fit(points, values, guess=kernel)
                 else:
@@ -82,7 +82,7 @@ class GaussianProcess(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
         promise = log_improvement(model, candidates, best)
-        # Search at decreasing distances around the best candidate so far.
+        # Draw candidates at decreasing distances from the best candidate so far.
         for reach in (0.1, 0.01, 0.001):
             closer = reach * self._rng.standard_normal((CANDIDATES // 3, d))
             closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)
@@ -93,7 +93,7 @@ class GaussianProcess(Optimizer):
 
 
 def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """Logarithm [k] of the expected improvement over the best value, at points x [k, d]."""
+    """Logarithm of the expected improvement over the best value [k] at points x [k, d]."""
     mean, share = model.predict(x)
     spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
     z = (best - mean[:, 0]) / spread
@@ -101,7 +101,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), accurate even for tiny values; z [k] is in standard deviations.
+    """The logarithm of phi(z) + z Phi(z), which is accurate even for tiny values; z [k] is in standard deviations.
 
     Example:
         >>> import numpy as np
@@ -109,7 +109,7 @@ def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
         [-0.919, -500000000028.55]
     """
     high, low = np.maximum(z, -1.0), np.minimum(z, -1.0)
-    # phi(z) + z Phi(z) = phi(z) (1 + z Phi(z) / phi(z)), whose second factor tends to 1 / z^2
+    # phi(z) + z Phi(z) = phi(z) (1 + z Phi(z) / phi(z)); the second factor tends to 1 / z^2.
     ratio = 1.0 + low * np.sqrt(np.pi / 2.0) * erfcx(-low / np.sqrt(2.0))
     rest = np.where(low < -1e4, -2.0 * np.log(-low), np.log(np.maximum(ratio, 1e-300)))
     tail = -0.5 * low**2 - 0.5 * np.log(2.0 * np.pi) + rest

@@ -1,40 +1,41 @@
-"""Grey wolf optimizers: the canonical GWO, which is the paper's baseline, and the paper's method, SGWO-IM.
+"""Grey wolf optimizers: the canonical GWO, which is the baseline of the SGWO-IM paper, and SGWO-IM itself.
 
-GWO: S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014. The
-following choices apply where descriptions and common implementations differ:
+GWO: S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014. Where
+descriptions and common implementations differ, the following choices apply:
 
 - Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T). The move after the last
   evaluation is omitted, so a run takes exactly N T evaluations.
 - alpha, beta and delta are the three best *distinct* points of the whole run (not of the last generation), with ties in
   the order of evaluation. Wolves at the same point count as one leader.
 - Wolves always move, even to a worse position.
-- Positions outside the bounds are clipped to them before evaluation.
+- Positions outside the bounds are clipped to the bounds before evaluation.
 - A failed evaluation (+inf) ranks last and has no other effect.
-- C multiplies a position, so steps are short near the origin of the coordinates and long far from it. The pack is
-  therefore biased towards the origin, as in the published method.
+- C multiplies a position, so steps are short near the origin of the coordinates and long far from the origin. As in the
+  published method, the pack is therefore biased towards the origin.
 
 SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory: X. Zou, P. Tang, P. Liu, C. Tai, "Efficient
 and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels", Algorithm 1 and
-eqs. 2 to 4. The defaults are those of its Table II: N = 30, T = 20, cosine convergence, memory weight 0.1 to 0.3, 5
-full iterations, and K = 5 real evaluations in each later iteration. A run thus takes 5 * 30 + 15 * 5 = 225 evaluations.
+eqs. 2 to 4. The defaults are those of Table II in the paper: N = 30, T = 20, cosine convergence, memory weight 0.1 to
+0.3, 5 full iterations, and K = 5 real evaluations in each later iteration. A run therefore takes 5 * 30 + 15 * 5 = 225
+evaluations.
 
-The following choices apply where the paper is silent, in addition to those of GWO:
+Where the paper is silent, the following choices apply, in addition to those for GWO:
 
 - "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real evaluations
   of the run, including those that were not requested.
-- Wolves that the surrogate does not select still move; only their real evaluations change their memory.
+- Wolves that the surrogate does not select still move. Only real evaluations change the memory of a wolf.
 - Each memory starts at the initial position with a score of infinity, and is replaced only by an evaluation with a
   strictly lower score.
-- The K elites are evaluated in ascending order of their predictions; ties keep the order of the pack.
-- Memory fusion (eq. 3) uses the unclipped X_GWO; the fused position is clipped.
-- Predictions only determine which wolves are evaluated: leaders, memories and the best point come from the archive of
+- The K elites are evaluated in ascending order of their predicted values; ties keep the order of the pack.
+- Memory fusion (eq. 3) uses X_GWO before clipping; the fused position is then clipped.
+- Predictions only determine which wolves are evaluated. Leaders, memories and the best point come from the archive of
   real evaluations.
 
 With `w_min = w_max = 0`, linear convergence and no surrogate, SGWO-IM gives the same results as GWO, bit for bit.
 
-The surrogate is SciPy's `RBFInterpolator`, cubic with a linear tail, on inputs scaled to the unit cube, with smoothing
-1e-6. Repeated points are merged and their objectives averaged. A failed evaluation is assigned the worst successful
-value, so that the model avoids its point and is not distorted by infinity.
+The surrogate is SciPy's `RBFInterpolator` with a cubic kernel, a linear tail, inputs scaled to the unit cube and
+smoothing 1e-6. Repeated points are merged, and their objectives are averaged. A failed evaluation is assigned the worst
+successful value, so that the model avoids the failed point and contains no infinite value.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ WOLVES = 30
 """Number of wolves, the paper's N (Table II)."""
 
 LEAST_BUDGET = 24
-"""Smallest budget of both methods; SGWO-IM then has three wolves, one for each leader, and uses the whole budget."""
+"""Smallest budget of both methods. SGWO-IM then has three wolves, one for each leader, and uses the whole budget."""
 
 FULL_ITERATIONS = 5
 """Number of iterations that evaluate all wolves (Table II)."""
@@ -70,7 +71,7 @@ SMOOTHING = 1e-6
 
 
 def linear_decay(iteration: int, iterations: int) -> float:
-    """The standard convergence factor a(t) = 2 (1 - t / T) of iteration t = 1..T."""
+    """The standard convergence factor a(t) = 2 (1 - t / T) in iteration t = 1..T."""
     return 2.0 * (1.0 - iteration / iterations)
 
 
@@ -95,7 +96,7 @@ def encircle(
 def whole_iterations(budget: int) -> dict[str, int]:
     """The settings of GWO for a budget: 30 wolves, and as many complete iterations as the budget allows.
 
-    There are fewer wolves if the budget does not allow two iterations of 30 wolves.
+    If the budget does not allow two iterations of 30 wolves, there are fewer wolves.
 
     Example:
         >>> whole_iterations(600), whole_iterations(45)
@@ -107,7 +108,7 @@ def whole_iterations(budget: int) -> dict[str, int]:
 
 @final
 class GWO(Optimizer):
-    """Grey Wolf Optimizer. Uses only objective values; 600 evaluations with the paper's settings.
+    """Grey Wolf Optimizer. Uses only objective values; takes 600 evaluations with the paper's settings.
 
     Args:
         population: N, number of wolves.
@@ -159,7 +160,7 @@ class GWO(Optimizer):
 
 
 def cosine_decay(iteration: int, iterations: int) -> float:
-    """The paper's convergence factor a(t) = 2 cos(pi t / (2 T)) of iteration t = 1..T (eq. 2)."""
+    """The paper's convergence factor a(t) = 2 cos(pi t / (2 T)) in iteration t = 1..T (eq. 2)."""
     return 2.0 * cos(0.5 * pi * iteration / iterations)
 
 
@@ -189,17 +190,17 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
 @final
 class SGWOIM(Optimizer):
-    """The paper's optimizer. Uses only objective values; 225 evaluations with the paper's settings.
+    """The paper's optimizer. Uses only objective values; takes 225 evaluations with the paper's settings.
 
     Args:
         population: N, number of wolves.
         iterations: T, number of iterations.
         full_iterations: Number of iterations that evaluate the whole population before the surrogate selects wolves.
         elites: K, number of wolves evaluated in each later iteration.
-        w_min: Memory weight at the start.
-        w_max: Memory weight at the end.
+        w_min: Memory weight at the start of the run.
+        w_max: Memory weight at the end of the run.
         convergence: "cosine" (the paper's eq. 2) or "linear" (standard GWO).
-        surrogate: Whether the surrogate selects wolves; without it, every iteration evaluates the whole population.
+        surrogate: Whether the surrogate selects wolves; if not, every iteration evaluates the whole population.
 
     Raises:
         InputError: An argument is out of range.
@@ -250,14 +251,14 @@ class SGWOIM(Optimizer):
 
     @property
     def memory(self) -> Evaluations:
-        """The best evaluation of each wolf; before its first evaluation, its initial position and the value +inf.
+        """The best evaluation of each wolf; before the first evaluation, the initial position and the value +inf.
 
         Raises:
             InputError: `ask` has not been called yet.
         """
         if self._memory is None:
             raise InputError(
-                "the pack has no memory before its first evaluation: call ask() and tell() first"
+                "the pack has no memory before the first evaluation: call ask() and tell() first"
             )
         return self._memory
 
@@ -292,7 +293,7 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
 
 
 def predict(archive: Archive, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Predict the objective at candidates [n, d] from all real evaluations; zero if all of these failed.
+    """Predict the objective at candidates [n, d] from all real evaluations; zero if all evaluations failed.
 
     The archive must contain more than d distinct points that span the box.
     """

@@ -3,20 +3,20 @@
 Local searches are cheap if the engine returns derivatives, and a batch of candidates takes little longer than one
 candidate. Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in
 progress. Because of slab resonances, RMSE is a multimodal function of the permittivities, so one starting point is not
-enough. A search that comes close to a better one is merged with it. A search that is too far behind the best one to
-catch up is abandoned, and its last point is kept as another minimum (`minima`). Minima that fit nearly as well show how
-ambiguous the best one is. `descent.py` computes the steps.
+enough. A search that comes close to a better search is merged with the better search. A search that cannot catch up
+with the best search is abandoned, and its last point is kept as another minimum (`minima`). Minima that fit nearly as
+well show how ambiguous the best minimum is. `descent.py` computes the steps.
 
-Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If another minimum fitted
-better and had an equally wide basin, all searches would have missed it with a probability of e^-k after k returns. All
-starting points are used if fewer searches end in the best minimum. (The Bayesian rule of Boender and Rinnooy Kan,
-Mathematical Programming 37, 1987, counts the different minima, which requires every search to be followed to its end.)
+Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If there is a better
+minimum with an equally wide basin, the probability that all searches have missed this minimum is e^-k after k returns.
+If fewer searches end in the best minimum, all starting points are used. (The Bayesian rule of Boender and Rinnooy Kan,
+Mathematical Programming 37, 1987, counts the different minima, which requires every search to run to its end.)
 
 If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
-start from the combinations that fit best, until they find no better minimum. If there is at least one full round of
+start from the combinations that fit best, until no better minimum is found. If there is at least one full round of
 starting points, basin hopping follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from
-the best minimum with one or two coordinates redrawn. A resonating slab repeats minima along its own coordinate, and
-materials act nearly independently, so a lower minimum often differs in only a few coordinates.
+the best minimum with one or two coordinates redrawn. A resonating slab causes repeated minima along the coordinate of
+its material, and materials act nearly independently. A lower minimum therefore often differs in only a few coordinates.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ CATCH_UP = 100.0
 """A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted decrease."""
 
 NEARER = 10.0
-"""The same multiple for searches from combined minima, which start near the minima that they reach."""
+"""Value of `CATCH_UP` for searches from combined minima, which start close to the minima that they reach."""
 
 COMBINATIONS = 32
-"""Largest number of combinations of minima that are tried at a time; the number of starting points is a further limit.
+"""Maximum number of combinations of minima tried at a time; the number of starting points is another limit.
 """
 
 FOLLOWED = 0.2
-"""Share of the combinations from which searches start; these are the combinations that fit best."""
+"""Fraction of the combinations, the best-fitting ones, from which searches start."""
 
 PARENTS = 12
-"""Number of lowest minima that are combined."""
+"""Number of minima that are combined, starting from the lowest."""
 
 SPACE = 0.05
 """Smallest distance in the unit cube between a combination and a known minimum or another combination."""
@@ -63,20 +63,21 @@ HOPS = 8
 
 PATIENCE = 6
 """Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that
-use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine with 3, and two with 6.
+use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine runs with 3, and two
+runs with 6.
 """
 
 RETURNS = 10
 """Number of searches ending in the best minimum after which the method starts no more searches."""
 
 LEVEL = 1e-4
-"""Relative difference in mean square below which two minima are considered to fit equally well, as along a valley."""
+"""Relative difference in mean square below which two minima, for example along a valley, fit equally well."""
 
 NOISELESS = 1e-9
-"""Share of the largest mean square added to this difference; without noise, the lowest values are rounding errors."""
+"""Fraction of the largest mean square added to the tolerance of `LEVEL`, for rounding errors in noiseless problems."""
 
 APART = 0.01
-"""Distance in the unit cube below which two searches are considered to have ended in the same minimum."""
+"""Distance in the unit cube below which two searches have ended in the same minimum."""
 
 
 @final
@@ -84,17 +85,17 @@ class LeastSquares(Optimizer):
     """Multi-start Levenberg-Marquardt. Uses residuals and Jacobians; it has no budget and stops by itself.
 
     Args:
-        seed: Seed of the scrambled Sobol points from which searches start, and of basin hopping.
-        starts: Largest number of Sobol points; powers of two cover the box most evenly. Each costs about ten
-            evaluations. If all are used, combinations of the minima and basin hopping need about the same number of
+        seed: Seed of basin hopping and of the scrambled Sobol points from which searches start.
+        starts: Maximum number of Sobol points; powers of two cover the box most evenly. Each point costs about ten
+            evaluations. If all points are used, combinations of the minima and basin hopping need about as many
             evaluations again. The best point passed to `tell` before the first `ask`, if any, is a further starting
             point.
         x0: Further starting points, [d] or [k, d].
-        iterations: Largest number of steps of each search.
+        iterations: Maximum number of steps of each search.
         tolerance: A search has converged if its model predicts a relative decrease in mean square below this tolerance,
             or a step shorter than the tolerance in the unit cube.
-        catch_up: A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted
-            decrease. Use a smaller number if some starting points are already minima and the others are only checked
+        catch_up: A search is abandoned if its cost exceeds the lowest cost by more than this multiple of its predicted
+            decrease. Use a smaller number if some starting points are already minima, and the other points only check
             for a better minimum.
 
     Raises:
@@ -150,7 +151,7 @@ class LeastSquares(Optimizer):
             ended = yield from self._descended(unit, ended, self.catch_up)
             if returns(ended) >= RETURNS:
                 break
-            # The user's starting points and the best earlier point belong to the first round only.
+            # The user's starting points and the best earlier point are used only in the first round.
             unit = unit[:0]
         if ended is not None and len(ended.cost):
             if returns(ended) < RETURNS:
@@ -196,7 +197,7 @@ class LeastSquares(Optimizer):
 
 
 def returns(ended: Starts) -> int:
-    """Number of searches that ended in the best minimum or in an equally good one, including merged searches."""
+    """Number of searches that ended in the best minimum or an equally good minimum, including merged searches."""
     if not len(ended.cost):
         return 0
     return int(ended.searches[ended.cost <= ended.cost.min() + _slack(ended)].sum())
@@ -206,18 +207,18 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
     """Combine minima [k, d], best first, into at most `number` points from which searches can reach other minima.
 
     The best minimum is shifted by the difference between two minima, or one of its coordinates is replaced with that of
-    another minimum. Shifts help because one cause, such as a resonating slab, repeats minima at equal distances,
-    regardless of the other parameters. They correspond to the mutation of differential evolution (Storn and Price,
-    Journal of Global Optimization 11, 1997). Exchanges correspond to its crossover. They help if parameters act nearly
-    independently, such as those of materials that rarely occur on the same path. Points within `SPACE` of a minimum are
-    excluded. Shifts and exchanges alternate, starting with those of the lowest minima.
+    another minimum. Shifts help because a single cause, such as a resonating slab, repeats minima at equal distances,
+    regardless of the other parameters. Shifts correspond to mutation in differential evolution (Storn and Price,
+    Journal of Global Optimization 11, 1997), and exchanges correspond to crossover. Exchanges help if parameters act
+    nearly independently, such as the parameters of materials that rarely occur on the same path. Points within `SPACE`
+    of a minimum are excluded. Shifts and exchanges alternate, starting with those of the lowest minima.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))
-    # Pairs of the lowest minima first.
+    # Pairs of the lowest minima come first.
     order = np.lexsort((target + source, np.maximum(target, source)))
     shifted = best + (low[target] - low[source])[order]
-    # The best minimum with each coordinate of each other minimum in turn.
+    # The best minimum takes each coordinate of each other minimum in turn.
     exchanged = np.where(np.eye(dimension, dtype=bool), low[1:, None], best).reshape(-1, dimension)
     new = [_new(points, minima) for points in (shifted, exchanged)]
     turn = np.argsort(np.concatenate([np.arange(len(points)) for points in new]), kind="stable")
@@ -231,7 +232,7 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
 
 
 def hops(best: NDArray[np.float64], number: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Copies [number, d] of a point of the unit cube [d], each with one or two coordinates redrawn at random."""
+    """Copy a point of the unit cube [d]; one or two coordinates of each copy [number, d] are redrawn at random."""
     points = np.repeat(best[None], number, axis=0)
     for point in points:
         count = min(len(best), random.integers(1, 3))
@@ -256,13 +257,15 @@ def _user_starts(x0: ArrayLike | None, box: Box) -> NDArray[np.float64]:
     try:
         points = np.atleast_2d(np.array(x0, dtype=float))
     except (ValueError, TypeError):
-        raise InputError(f"x0 = {shortened(repr(x0))}: must be numbers, one for each parameter") from None
+        raise InputError(
+            f"x0 = {shortened(repr(x0))}; it must contain one number for each parameter"
+        ) from None
     if points.ndim != 2 or points.shape[1] != box.dimension:
         d = box.dimension
         raise InputError(f"x0 has shape {np.shape(x0)}; it must be [{d}] or [k, {d}]: reshape it")
     for row, column in np.argwhere(~((points >= box.lower) & (points <= box.upper))):
         raise InputError(
             f"x0[{row}, {column}] = {points[row, column]:g} lies outside its bounds "
-            f"[{box.lower[column]:g}, {box.upper[column]:g}]; move the start or widen the bounds"
+            f"[{box.lower[column]:g}, {box.upper[column]:g}]; move the starting point or widen the bounds"
         )
     return points

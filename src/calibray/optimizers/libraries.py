@@ -1,19 +1,19 @@
-"""Minimisers from other libraries as ask/tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
+"""Minimisers from other libraries, run as ask/tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
 
-- CMA-ES, in its author's package `cma`: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772. It
-  starts in the middle of the unit cube with a step size of 0.3.
-- DFO-LS, in its authors' package: C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and
-  Robustness of Model-Based Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32. It fits a
-  linear model to every residual in a trust region, one evaluation at a time. It is a local method.
+- CMA-ES, from the author's package `cma`: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772. The
+  search starts in the middle of the unit cube with a step size of 0.3.
+- DFO-LS, from the authors' package: C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and
+  Robustness of Model-Based Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32. DFO-LS is a
+  local method, which fits a linear model to every residual in a trust region, one evaluation at a time.
 - Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341. Each batch is one generation. SciPy's
   final polish, which would need derivatives, is omitted.
 
-All methods start at the best point already passed to `tell`, if any. They restart from a random point or population if
-they converge before their budget is used up.
+All methods start at the best point already passed to `tell`, if any. If a search converges before the budget is used
+up, the method restarts from a random point or population.
 
-A minimiser that calls its objective runs in a separate thread, and waits inside the objective for the evaluation. Only
-one of the two threads runs at a time, so a run is as reproducible as the library. If a search is dropped before its
-end, the objective raises an exception inside the library, which ends the thread.
+A minimiser that calls its objective runs in a separate thread, and waits in the objective for the evaluation. Only
+one of the two threads runs at a time, so a run is as reproducible as the library itself. If a search is dropped before
+its end, the objective raises an exception inside the library, which ends the thread.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; it is not an `Exception`, because a library might catch one."""
+    """Ends a minimiser whose search was dropped; this is not an `Exception`, because a library might catch it."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
     """Run a minimiser in a thread, and yield the candidates [n, d] whose evaluations it requests.
 
     Raises:
-        Exception: Whatever `minimise` raises.
+        Exception: Any exception that `minimise` raises.
     """
     questions: SimpleQueue[NDArray[np.float64] | BaseException | None] = SimpleQueue()
     answers: SimpleQueue[Evaluations | None] = SimpleQueue()
@@ -121,7 +121,7 @@ class CMAES(Optimizer):
             "verbose": -9,
         }
         if len(start) == 1:
-            options["maxstd_boundrange"] = np.inf  # the limit of cma 4.5 fails in one dimension
+            options["maxstd_boundrange"] = np.inf  # the default limit of cma 4.5 fails in one dimension
         while True:
             strategy = self._cma.CMAEvolutionStrategy(start, 0.3, options)
             while not strategy.stop():
@@ -138,8 +138,8 @@ class DFOLS(Optimizer):
     Args:
         seed: Seed of the random points at which searches restart.
         budget: Number of evaluations.
-        radius: Initial trust-region radius, as a share of the box width.
-        tolerance: Trust-region radius at which a search has converged, as a share of the box width.
+        radius: Initial trust-region radius, as a fraction of the box width.
+        tolerance: Trust-region radius at which a search has converged, as a fraction of the box width.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.
@@ -161,7 +161,7 @@ class DFOLS(Optimizer):
         self.box = Box.between(lower, upper)
         self._budget = whole("budget", budget, at_least=1)
         self.radius = real("radius", radius, at_least=1e-6, at_most=0.5)
-        # DFO-LS requires an initial radius larger than the final one.
+        # DFO-LS requires an initial radius that is larger than the final radius.
         self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=0.5 * self.radius)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._dfols = library("dfols", "optimizers")
@@ -200,7 +200,7 @@ def _minimise_residuals(
             rhoend=radii[1],
             maxfun=budget + d + 2,  # `limited` enforces the budget, and DFO-LS warns if it is small
             do_logging=False,
-            # Coordinate directions are used, because random ones would be drawn from NumPy's global generator.
+            # Coordinate directions are used, because random directions would be drawn from NumPy's global generator.
             user_params={"init.random_initial_directions": False},
         )
         if len(archive) == before:
@@ -214,7 +214,7 @@ class DifferentialEvolution(Optimizer):
 
     Args:
         budget: Number of evaluations.
-        population: Number of candidates per generation as a multiple of d; SciPy uses at least 5 candidates.
+        population: Number of candidates per generation, as a multiple of d; SciPy uses at least five candidates.
 
     Raises:
         InputError: An argument is out of range.
@@ -242,7 +242,7 @@ def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluat
     def objective(unit: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
         return archive.imputed(evaluate(box.from_unit(unit.T))).y
 
-    # With bounds other than the unit cube, rounding in SciPy may move a start on a face outside them.
+    # With bounds other than the unit cube, SciPy's rounding may move a starting point on a face out of bounds.
     start = box.to_unit(archive.best.x) if len(archive) else None
     while True:
         differential_evolution(

@@ -1,13 +1,13 @@
 """SGWO-IM as a sampler for Optuna, for use with Optuna's storages, dashboard and workers.
 
-Every candidate is stored in the trial that receives it. A new sampler with the same seed on a stored study therefore
-repeats the same candidates, uses their stored answers, and continues where the study stopped. Trials that the sampler
-did not propose (enqueued, or from another sampler) are added to the archive and can become leaders of the pack. A
-failed trial is treated as a failed evaluation.
+Every candidate is stored in the trial that receives it. If a new sampler with the same seed is used on a stored study,
+it therefore repeats the same candidates, uses the stored answers, and continues where the study stopped. Trials that
+the sampler did not propose, such as enqueued trials or trials of another sampler, are added to the archive and can
+become leaders of the pack. A failed trial is treated as a failed evaluation.
 
-The pack cannot move before the iteration is complete. If every open candidate is being evaluated, one that another
-process is evaluating is returned again, because that process might have ended. If there is no such candidate, the trial
-is a random point.
+The pack cannot move before the iteration is complete. If every open candidate is being evaluated, a candidate that
+another process is evaluating is returned again, because that process might have ended. If no other process is
+evaluating a candidate, the trial is a random point.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ else:
     TrialState = optuna.trial.TrialState
 
 CANDIDATE = "sgwo-im:candidate"
-"""System attribute of a trial that contains its candidate in search coordinates."""
+"""System attribute of a trial that stores the candidate in search coordinates."""
 
 
 @final
 class SGWOIMSampler(BaseSampler):
-    """The paper's optimizer for an Optuna study of one objective.
+    """The paper's optimizer (SGWO-IM) for an Optuna study with one objective.
 
     Args:
-        search_space: The parameters and their distributions, float or integer. If None, they are inferred from the
-            trials, so the first trial is a random point. Categorical parameters are then sampled at random.
+        search_space: The parameters and their distributions, float or integer. If None, the search space is inferred
+            from the trials, so the first trial is a random point. Categorical parameters are then sampled at random.
         seed: Seed.
         **settings: Further settings of `SGWOIM`.
 
@@ -94,13 +94,15 @@ class SGWOIMSampler(BaseSampler):
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Return a candidate of the pack, preferably one that no trial is evaluating; empty if Optuna should draw one.
+        """Return a candidate of the pack, preferably one not yet under evaluation; empty for a random point.
 
         Raises:
             InputError: The study has several objectives.
         """
         if len(study.directions) != 1:
-            raise InputError(f"the study has {len(study.directions)} objectives; SGWO-IM takes 1: choose one")
+            raise InputError(
+                f"the study has {len(study.directions)} objectives, but SGWO-IM supports one objective: choose one"
+            )
         if not search_space:
             return {}
         with self._lock:
@@ -140,7 +142,7 @@ class SGWOIMSampler(BaseSampler):
                     study.stop()
 
     def _synchronized(self, study: Study, space: Mapping[str, BaseDistribution]) -> SGWOIM:
-        """The optimizer after it has received every finished trial of the study, in order."""
+        """Pass every finished trial of the study to the optimizer, in order, and return the optimizer."""
         if self._optimizer is None or self._space != space:
             bounds = np.array([_bounds(cast("Numeric", distribution)) for distribution in space.values()])
             self._optimizer, self._space, self._told = SGWOIM(*bounds.T, **self._settings), dict(space), set()
@@ -157,17 +159,17 @@ class SGWOIMSampler(BaseSampler):
         state: TrialState,
         values: Sequence[float] | None,
     ) -> None:
-        """Pass a finished trial to the optimizer, unless it was passed before."""
+        """Pass a finished trial to the optimizer, unless the trial was already passed."""
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)
-        optimizer.ask()  # the iteration must begin before `tell` receives its answers, even if all are already stored
+        optimizer.ask()  # the iteration must begin before `tell` receives answers, even if all answers are stored
         x = np.array(trial.system_attrs.get(CANDIDATE, self._foreign(trial)), dtype=float)
         if x.shape != optimizer.box.lower.shape or not np.array_equal(x, optimizer.box.clip(x)):
             return
         sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
         answer = sign * values[0] if state == TrialState.COMPLETE and values else np.inf
-        # Optuna accepts infinite values, but no search can improve on an infinitely good one; it counts as failed.
+        # Optuna accepts infinite values, but no search can improve on -inf, so an infinite value counts as a failure.
         optimizer.tell([x], [answer if np.isfinite(answer) else np.inf])
 
     def _foreign(self, trial: FrozenTrial) -> list[float]:

@@ -1,8 +1,8 @@
-"""Interfaces of optimizers (`ask` returns candidates, `tell` receives their evaluations) and of optional cheap models.
+"""Interfaces of optimizers (`ask` returns candidates, `tell` receives their evaluations) and optional cheap models.
 
 An algorithm is a generator that yields the candidates [n, d] of each iteration and receives their evaluations, so that
-its code can follow its paper. A `Session` suspends the algorithm between `ask` and `tell`, checks the evaluations,
-keeps the archive, and collects the answers to a batch, which can arrive in any order and in portions.
+its code can follow the paper. A `Session` suspends the algorithm between `ask` and `tell`, checks the evaluations,
+keeps the archive, and collects the answers to a batch. Answers can arrive in any order and in several calls.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from calibray.optimizers.evaluations import (
 )
 
 Search = Generator[NDArray[np.float64], Evaluations, None]
-"""An algorithm: it yields candidates [n, d] inside the box and receives their evaluations in the same order."""
+"""An algorithm, which yields candidates [n, d] inside the box and receives their evaluations in the same order."""
 
 
 class Session:
@@ -38,7 +38,7 @@ class Session:
     Args:
         box: The search box.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
-        search: Function that starts the algorithm on the archive; the algorithm does not run before the first `ask`.
+        search: Function that starts the algorithm with the archive; the algorithm does not run before the first `ask`.
         objective: Function that converts residuals to the value, if residuals are used.
 
     Attributes:
@@ -91,7 +91,7 @@ class Session:
             links = evaluations.residuals.shape[1]
             if self._links not in (None, links):
                 raise InputError(
-                    f"residuals have {links} columns, but earlier ones had {self._links}; pass the same links"
+                    f"residuals have {links} columns, but earlier residuals had {self._links}; pass the same links"
                 )
             if self._objective is not root_mean_square:
                 check_order(evaluations, self.archive)
@@ -99,12 +99,12 @@ class Session:
         self.archive.add(evaluations)
         if self._asked is None:
             return
-        # If the whole batch comes in the requested order, points need not be matched one by one.
+        # If the whole batch arrives in the requested order, points need not be matched individually.
         if np.array_equal(evaluations.x, self._asked) and len(self._open) == len(self._asked):
             self._answers, self._open = {0: evaluations}, self._open[:0]
             return
         for row, point in enumerate(evaluations.x):
-            # If candidates of a batch are equal, the answer belongs to the first one without an answer.
+            # If candidates of a batch are equal, the answer belongs to the first candidate without an answer.
             same = np.flatnonzero((self._asked[self._open] == point).all(axis=1))
             if same.size:
                 self._answers[int(self._open[same[0]])] = evaluations.rows(np.array([row]))
@@ -123,7 +123,7 @@ class Session:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """End a search at the budget, shortening its last batch; the search itself must not end earlier."""
+    """Stop a search at the budget, and shorten the last batch if necessary. The search itself must not end earlier."""
     with closing(search):
         x = next(search)
         while True:
@@ -135,7 +135,7 @@ def limited(search: Search, budget: int) -> Search:
 
 
 def first_start(archive: Archive) -> NDArray[np.float64]:
-    """Starting point of a local search in the unit cube [d]: the best point passed to `tell`, or else the middle."""
+    """Starting point [d] of a local search in the unit cube: the best point passed to `tell`, or else the middle."""
     return archive.box.to_unit(archive.best.x) if len(archive) else np.full(archive.box.dimension, 0.5)
 
 
@@ -144,7 +144,7 @@ class Schedule:
     """Settings with which a method respects a budget.
 
     Attributes:
-        settings: Function that maps a number of evaluations to constructor arguments that respect it.
+        settings: Function that maps a budget of evaluations to constructor arguments that respect the budget.
         least: Smallest budget with which the method can run.
     """
 
@@ -157,25 +157,26 @@ AS_GIVEN: Final = Schedule(lambda budget: {"budget": budget})
 
 
 class Optimizer(ABC):
-    """Minimises a value over a box; the caller runs the loop.
+    """Minimises a function over a box; the caller runs the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
-    settings in the constructor, passes its algorithm to a `Session`, sets the attributes below whose defaults do not
-    apply, and overrides nothing else.
+    settings in the constructor and passes its algorithm to a `Session`. It sets the attributes below whose defaults do
+    not apply, and overrides nothing else.
 
     The value can be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
     their mean square, so the value must increase with the mean square. For a likelihood, pass deviance residuals
     sign(r) sqrt(2 (l(r) - l(0))) to `tell`, where r are residuals with negative log likelihood l.
 
     Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, the seed of the random generator. If
-    residuals are used, it also takes `objective`, a function that maps residuals [n, m] to the value [n]; the default
-    is the root mean square. `tell` checks that values agree with this function and increase with the mean square.
+    residuals are used, the constructor also takes `objective`, a function that maps residuals [n, m] to the value [n];
+    the default is the root mean square. `tell` checks that values agree with this function and increase with the mean
+    square.
 
     Attributes:
         uses: The parts of an evaluation that the method uses: "value", "residuals", "jacobian".
         schedule: Schedule with which the method respects a budget; None if the method stops by itself.
-        takes_starts: Whether the constructor takes `x0`, starting points, and `starts`, the number of further starting
-            points. Most methods also use the points passed to `tell` before the first `ask`.
+        takes_starts: Whether the constructor takes starting points (`x0`) and the number of further starting points
+            (`starts`). Most methods also use the points passed to `tell` before the first `ask`.
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
@@ -191,7 +192,7 @@ class Optimizer(ABC):
 
     @classmethod
     def within(cls, budget: int) -> dict[str, int]:
-        """The constructor arguments that respect a budget; none if the method stops by itself.
+        """The constructor arguments that respect a budget; empty if the method stops on its own.
 
         Raises:
             InputError: The budget is too small for the method.
@@ -200,13 +201,13 @@ class Optimizer(ABC):
             return {}
         if budget < cls.schedule.least:
             raise InputError(
-                f"budget = {budget}; {cls.__name__} needs at least {cls.schedule.least} evaluations: raise it"
+                f"budget = {budget}; {cls.__name__} needs at least {cls.schedule.least} evaluations: raise the budget"
             )
         return cls.schedule.settings(budget)
 
     @property
     def budget(self) -> int | None:
-        """Largest number of evaluations that the method requests; None if it stops by itself."""
+        """Maximum number of evaluations that the method requests; None if the method stops on its own."""
         return self._budget
 
     @property
@@ -216,7 +217,7 @@ class Optimizer(ABC):
 
     @property
     def best(self) -> Best:
-        """The best real evaluation so far, with `.x` [d] and `.y`.
+        """The best evaluation so far: the point `x` [d] and the value `y`.
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.
@@ -225,7 +226,7 @@ class Optimizer(ABC):
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """The best point, then the distinct minima that the method keeps, which can include the best point [k, d].
+        """The best point, followed by the distinct minima that the method keeps [k, d]; the best point can occur twice.
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.
@@ -234,11 +235,11 @@ class Optimizer(ABC):
 
     @property
     def evaluations(self) -> int:
-        """Number of evaluations so far, requested or not."""
+        """Number of evaluations so far, whether requested or not."""
         return len(self._session.archive)
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates [n, d] to evaluate next, inside the bounds: the unanswered candidates of the current batch.
+        """The candidates [n, d] to evaluate next: the candidates of the current batch that have no evaluation yet.
 
         Raises:
             InputError: The optimizer is done.
@@ -254,15 +255,16 @@ class Optimizer(ABC):
     ) -> None:
         """Pass evaluations to the optimizer; all arrays are copied.
 
-        Requested candidates can be passed in any order and in portions; the search continues when the batch is
-        complete. Points that were not requested, for instance those of an earlier run, are added to the archive. They
-        can become the best point, a leader or data for a surrogate, but they are not treated as answers to candidates.
+        Requested candidates can be passed in any order and in several calls; the search continues when the batch is
+        complete. Points that were not requested, such as points of an earlier run, are added to the archive. These
+        points can become the best point, a leader or data for a surrogate, but are not treated as answers to
+        candidates.
 
         Args:
             x: Points [n, d] inside the bounds.
             y: Values [n]; +inf for a failed evaluation.
             residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or so that the constructor's
-                `objective` returns y. Residuals are checked but not used if the method uses only the value.
+                `objective` returns y. If the method uses only the value, residuals are checked but not used.
             jacobian: Derivatives of the residuals with respect to the parameters [n, m, d].
 
         Raises:
@@ -276,7 +278,7 @@ class CheapAnswer(NamedTuple):
     """The output of a cheap model at n points, each with its own set of constants.
 
     Attributes:
-        residuals: Residuals in the order of the engine's residuals [n, m].
+        residuals: Residuals, in the order of the engine's residuals [n, m].
         by_point: Derivatives of the residuals with respect to the search coordinates [n, m, d].
         by_constant: Derivatives of the residuals with respect to the model's constants [n, m, q].
     """
@@ -288,7 +290,7 @@ class CheapAnswer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """Constants of a cheap model that the search does not change and that might be wrong.
+    """Constants of a cheap model that may be wrong and that the search does not change.
 
     Attributes:
         centre: Assumed values [q]; q can be 0.
@@ -309,7 +311,7 @@ class Constants:
 
     @property
     def width(self) -> NDArray[np.float64]:
-        """Upper minus lower bounds [q]."""
+        """Upper bounds minus lower bounds [q]."""
         return self.upper - self.lower
 
     def draw(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -327,7 +329,7 @@ class CheapModel(Protocol):
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Mask of the residuals that the model predicts [m]; for the others it returns an arbitrary constant."""
+        """Mask of the residuals that the model predicts [m]; other residuals are arbitrary constants."""
         ...
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:

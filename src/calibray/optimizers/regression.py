@@ -2,23 +2,23 @@
 
     K(x, x') = v_0 + v_1 h(x).h(x') + v_2 M(x, x') + nugget [x = x']
 
-M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
-a cheap model at x, if there is one. v_0 allows for an offset, v_1 for a change in response and v_2 for a smooth
-remainder. All residuals share K, so one factorization suffices for any number of residuals. With a linear trend, the
-coefficients of 1 and x are unknown and have no prior (universal kriging).
+M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. If there is a cheap
+model, h(x) is its response at x. v_0 allows for an offset, v_1 for a change in response, and v_2 for a smooth
+remainder. All residuals share K, so a single factorization suffices for any number of residuals. With a linear trend,
+the coefficients of 1 and x are unknown and have no prior (universal kriging).
 
-One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal combinations of the
-points for which the trend vanishes; without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C
-A^-1 C^T replaces K^-1.
+One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal contrasts, for which
+the trend vanishes; without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T replaces
+K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
 2.42, 4.17, 5.9 and sec. 9.9; closed-form leave-one-out errors: S. Rippa, Adv. Comput. Math. 11 (1999) 193.
 
-`Kriging` interpolates all residuals with length scales that are estimated from them. Every residual is a linear trend
-plus a weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input scales (one
-per parameter, so a parameter without influence drops out). The scales maximise the restricted log likelihood summed
-over all residuals. With tens of links, a dozen points determine the scales well. The variance of each residual is
-profiled out.
+`Kriging` interpolates all residuals with length scales that are estimated from the residuals. Every residual is a
+linear trend plus a weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input
+scales. There is one scale per parameter, so a parameter without influence drops out. The scales maximise the restricted
+log likelihood summed over all residuals. With tens of links, a dozen points determine these scales well. The variance
+of each residual is profiled out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 SINGULAR = 1e10
-"""Value of the negative log likelihood if the kernel matrix cannot be factored."""
+"""Value of the negative log likelihood if the kernel matrix cannot be factorized."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Inputs:
 
     Attributes:
         unit: Coordinates in the unit cube [n, d].
-        response: Response h of a cheap model at the points [n, r]; r = 0 without a cheap model.
+        response: Response h of the cheap model at the points [n, r]; without a cheap model, r = 0.
     """
 
     unit: NDArray[np.float64]
@@ -83,11 +83,11 @@ class Kernel:
         return np.concatenate([variances, np.log(self.rates), [np.log(self.nugget / scale**2)]])
 
     def scaled(self, factor: float) -> Kernel:
-        """The kernel with its variances and nugget multiplied by a factor."""
+        """The kernel with the variances and the nugget multiplied by a factor."""
         return Kernel(factor * self.variances, self.rates, factor * self.nugget)
 
     def covariance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
-        """Covariance [k, n] between points a [k] and b [n], without the nugget."""
+        """Covariance [k, n] between the points a [k] and b [n], without the nugget."""
         smooth = matern(self.distance(a, b))
         return self.variances[0] + self.variances[1] * a.response @ b.response.T + self.variances[2] * smooth
 
@@ -100,7 +100,7 @@ class Kernel:
         return self.covariance(at, at) + self.nugget * np.eye(len(at.unit))
 
     def distance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
-        """Distance between points in units of the length scales [k, n]."""
+        """Distances between points [k, n], in units of the length scales."""
         return np.asarray(cdist(a.unit * self.rates, b.unit * self.rates), dtype=np.float64)
 
 
@@ -120,7 +120,7 @@ class Trend(NamedTuple):
             return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
         basis = trend_basis(unit)
         size = basis.shape[1]
-        # The first columns of Q span the trend, and the others are the contrasts.
+        # The first columns of Q span the trend, and the other columns are the contrasts.
         q, r = np.linalg.qr(basis, mode="complete")
         return Trend(q[:, size:], solve_triangular(r[:size], q[:, :size].T))
 
@@ -155,7 +155,7 @@ class Process:
 
     @property
     def precision(self) -> NDArray[np.float64]:
-        """Inverse of the factor by which K is multiplied for each residual [m]."""
+        """Inverse of the factor by which K is multiplied to give the covariance of each residual [m]."""
         return _precision(len(self.whitened), np.sum(self.whitened**2, axis=0), self.freedom)
 
     @property
@@ -176,7 +176,7 @@ class Process:
         cross, prior = self.kernel.covariance(at, self.inputs), self.kernel.variance(at)
         mean, unexplained = cross @ self.weights, cross
         if self.linear:
-            # The weights g = basis @ left_inverse interpolate the trend. The remaining term to predict is z(x) - g.y.
+            # The weights g = basis @ left_inverse interpolate the trend. The remainder z(x) - g.y is then predicted.
             basis, left_inverse = trend_basis(at.unit), self.trend.left_inverse
             spread = left_inverse @ self.kernel.matrix(self.inputs)
             mean = mean + basis @ self.coefficients
@@ -209,14 +209,14 @@ class Process:
         return self.weights / self.inverse_diagonal[:, None]
 
     def _whiten(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Whiten columns of values at the points [n, k]; returns [f, k]."""
+        """Whiten columns of values at the points [n, k], and return them as [f, k]."""
         return solve_triangular(self.lower, self.trend.contrasts.T @ columns, lower=True)
 
 
 def condition(
     inputs: Inputs, values: NDArray[np.float64], kernel: Kernel, *, linear: bool = False, freedom: float = 0.0
 ) -> Process:
-    """Condition a process on values; see `Process` for the arguments."""
+    """Condition a process on values; the arguments are described in `Process`."""
     trend, matrix = Trend.of(inputs.unit, linear), kernel.matrix(inputs)
     lower = np.asarray(np.linalg.cholesky(trend.contrasts.T @ matrix @ trend.contrasts), dtype=np.float64)
     whitened = solve_triangular(lower, trend.contrasts.T @ values, lower=True)
@@ -226,9 +226,9 @@ def condition(
 
 
 class Likelihood:
-    """Negative log likelihood of kernels, restricted to the contrasts, up to a constant.
+    """Restricted negative log likelihood of kernels (the likelihood of the contrasts), up to a constant.
 
-    Without a prior on the variances, each variance has its most likely value; with a prior, the residuals follow a
+    Without a prior on the variances, each variance takes its most likely value. With a prior, the residuals follow a
     multivariate t distribution. The arguments are described in `Process`.
     """
 
@@ -242,9 +242,10 @@ class Likelihood:
         self.contrasts = Trend.of(unit, linear).contrasts
 
     def __call__(self, kernel: Kernel) -> tuple[float, NDArray[np.float64]]:
-        """The value, and its gradient with respect to the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
+        """Return the value and its gradient [3 + d + 1].
 
-        The results are `SINGULAR` and zeros if the kernel matrix cannot be factored.
+        The gradient is with respect to the logarithms of v_0, v_1, v_2, the rates and the nugget. If the kernel
+        matrix cannot be factorized, the value is `SINGULAR` and the gradient is zero.
         """
         count, residuals = self.values.shape
         rates_squared = kernel.rates**2
@@ -273,14 +274,14 @@ class Likelihood:
 
 
 class Prior(NamedTuple):
-    """Independent, bounded normal priors on the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
+    """Independent normal priors, with bounds, on the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
 
     Attributes:
         mean: Means.
         spread: Standard deviations.
         lower: Lower bounds.
         upper: Upper bounds.
-        fixed: Number of leading entries that are fixed at their mean.
+        fixed: Number of leading entries that are fixed at their means.
     """
 
     mean: NDArray[np.float64]
@@ -299,11 +300,11 @@ def most_probable(
     guess: Kernel | None = None,
     steps: int = 30,
 ) -> Kernel:
-    """The kernel with the largest posterior density.
+    """Find the kernel with the largest posterior density.
 
     The variances and the nugget are multiplied by `scale` squared. The negative log density is divided by `divisor`,
-    which determines the size of the first step. Searches of at most `steps` steps start at the prior's mean and at
-    `guess`, such as the kernel of an earlier fit.
+    which determines the size of the first step. Searches of at most `steps` steps start at the mean of the prior and,
+    if given, at `guess`, such as the kernel of an earlier fit.
     """
     held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
 
@@ -323,13 +324,13 @@ def most_probable(
 
 
 def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The Matern kernel with smoothness 5/2 at distances [...] in units of length scales (eq. 4.17)."""
+    """The Matern-5/2 kernel at distances [...] in units of the length scales (eq. 4.17)."""
     a = np.sqrt(5.0) * distance
     return (1.0 + a + a * a / 3.0) * np.exp(-a)
 
 
 def matern_slope(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivative of the Matern kernel divided by the distance, M'(r) / r [...]; finite at 0."""
+    """Derivative of the Matern kernel divided by the distance, M'(r) / r [...]; this ratio is finite at 0."""
     a = np.sqrt(5.0) * distance
     return -5.0 / 3.0 * (1.0 + a) * np.exp(-a)
 
@@ -344,19 +345,19 @@ def _precision(free: int, square: NDArray[np.float64], freedom: float) -> NDArra
 
 
 NUGGET = 1e-8
-"""Nugget that keeps the matrix non-singular, as a share of the prior variance; negligible for any engine."""
+"""Nugget that keeps the matrix non-singular, as a fraction of the prior variance; it is negligible for any engine."""
 
 LENGTH = 0.3
-"""Prior median of a length scale, as a share of the cube's edge; its logarithm has a standard deviation of 1."""
+"""Prior median of a length scale, as a fraction of the cube's edge. The logarithm has a standard deviation of 1."""
 
 LOG_RATE_BOUNDS = (-3.0, 5.0)
-"""Bounds of the logarithm of a rate: length scales from 20 down to 0.007."""
+"""Bounds on the logarithm of a rate, which correspond to length scales from 20 down to 0.007."""
 
 NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
 
 CONSTANT = 1e-9
-"""A residual does not affect the scales if its standard deviation is below this share of the largest deviation."""
+"""A residual does not affect the scales if its standard deviation is below this fraction of the largest one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,7 +365,7 @@ class Kriging:
     """A fitted kriging model.
 
     Attributes:
-        process: The process; its variances are relative to the variances of the residuals.
+        process: The process, with variances relative to the variances of the residuals.
         root: Factor B of the prior covariance B^T B of the residuals [n - 1 - d, m].
     """
 
@@ -382,7 +383,7 @@ class Kriging:
         return np.sum(self.root**2, axis=0)
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predicted mean [k, m], and predictive variance as a share of the prior variance [k], for all residuals."""
+        """Predicted mean [k, m], and predictive variance as a fraction of the prior variance [k], for all residuals."""
         return self.process.predict(Inputs.plain(unit))
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -391,7 +392,7 @@ class Kriging:
         return self.process.mean(inputs), self.process.slope(inputs)
 
     def with_point(self, point: NDArray[np.float64]) -> Kriging:
-        """Add a point [d] as if its evaluation equalled the prediction; the mean and the prior stay unchanged."""
+        """Add a point [d] as if its evaluation had returned the prediction; the mean and the prior stay unchanged."""
         unit = np.vstack([self.process.inputs.unit, point])
         residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
         return Kriging(solve(unit, residuals, self.process.kernel).process, self.root)
@@ -406,8 +407,9 @@ def fit(
 ) -> Kriging:
     """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
 
-    There must be at least d + 2 points that span the cube. If `noisy`, the nugget is also estimated, for an engine with
-    noisy answers; otherwise, the model interpolates. `guess` is an additional starting point of the kernel search.
+    There must be at least d + 2 points that span the cube. If `noisy` is true, the engine's answers are noisy, so the
+    nugget is also estimated; otherwise, the model interpolates. `guess` is an additional starting point of the kernel
+    search.
     """
     spread = residuals.std(axis=0)
     varying = residuals[:, spread > CONSTANT * max(spread.max(), 1e-300)]
@@ -427,13 +429,13 @@ def likelihood(unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Lik
 
 
 def solve(unit: NDArray[np.float64], residuals: NDArray[np.float64], kernel: Kernel) -> Kriging:
-    """The model with a given kernel, fitted to residuals [n, m] at points of the unit cube [n, d]."""
+    """Build the model with a given kernel from residuals [n, m] at points of the unit cube [n, d]."""
     process = condition(Inputs.plain(unit), residuals, kernel, linear=True)
     return Kriging(process, process.root)
 
 
 def _prior(dimension: int, noisy: bool) -> Prior:
-    """The prior with v_0 = v_1 = 0 and v_2 = 1, because the variances of the residuals are profiled out."""
+    """The prior with v_0 = v_1 = 0; v_2 is 1, because the variances of the residuals are profiled out."""
     low, rates = float(np.log(NUGGET)), np.ones(dimension)
     return Prior(
         mean=np.concatenate(

@@ -1,6 +1,6 @@
 """Designs of points in the unit cube, and searches that evaluate one design and stop.
 
-These searches are baselines: any optimizer that learns from its evaluations should be better at an equal budget.
+These searches are baselines: any optimizer that learns from evaluations should perform better with the same budget.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
     """Draw points of the unit cube [count, dimension].
 
     The kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of `count` slices of every
-    dimension) and "sobol" (scrambled; the first `count` points of the next power of two).
+    dimension) and "sobol" (the first `count` points of a scrambled sequence whose length is the next power of two).
     """
     if kind == "random":
         return rng.random((count, dimension))
@@ -29,17 +29,17 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
-    # If interrupted while it reads its direction numbers, SciPy ignores the interruption and continues without them.
+    # If SciPy is interrupted while reading direction numbers, it ignores the interruption and continues without them.
     with defer_interruption():
         sequence = qmc.Sobol(dimension, rng=rng)
-    # Sobol points are balanced only in blocks whose size is a power of two, and SciPy warns about other sizes.
+    # Sobol points are balanced only in blocks of a power of two, and SciPy warns about other block sizes.
     return sequence.random_base2((count - 1).bit_length())[:count]
 
 
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """The Latin hypercube [count, dimension] with the largest minimum distance between points, out of `tries`."""
+    """Draw `tries` Latin hypercubes [count, dimension]; return that with the largest minimum point distance."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -48,9 +48,9 @@ def maximin_design(
 def draw_around(
     points: NDArray[np.float64], count: int, log_reach: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw points [count, d] around given points of the unit cube [n, d], at distances of several orders of magnitude.
+    """Draw points [count, d] around given points of the unit cube [n, d], at distances of various orders of magnitude.
 
-    The standard deviation is log-uniform from 10^`log_reach` to 10^-0.5.
+    The standard deviation of each point's offset is log-uniform from 10^`log_reach` to 10^-0.5.
     """
     near = points[rng.integers(0, len(points), count)]
     reach = 10.0 ** rng.uniform(log_reach, -0.5, (count, 1))
@@ -69,7 +69,7 @@ def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> 
 def not_evaluated(
     candidates: NDArray[np.float64], points: NDArray[np.float64], separation: float
 ) -> NDArray[np.float64]:
-    """The candidates [k, d] farther than `separation` from all evaluated points [n, d], or else the farthest one."""
+    """The candidates [k, d] farther than `separation` from all evaluated points [n, d], but at least the farthest."""
     distance = distance_to_nearest(candidates, points)
     return candidates[distance > min(separation, np.nextafter(distance.max(), -np.inf))]
 

@@ -1,27 +1,27 @@
-"""The vector surrogate models every residual instead of their root mean square, and searches this model globally.
+"""The vector surrogate models every residual instead of the root mean square, and searches this model globally.
 
 The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
-information than this sum. Residuals are smoother than the objective, and tens of them share one kernel over the
-parameters (`regression.py`).
+information than this sum. Residuals are smoother than the objective, and tens of residuals share a single kernel over
+the parameters (`regression.py`).
 
 A run begins with a maximin Latin hypercube. The design needs few points even for many parameters, because residuals can
-be modelled as soon as the points determine a linear trend. After the design, three kinds of steps alternate on a model
-that is updated after every batch:
+be modelled as soon as the points determine a linear trend. After the design, three kinds of steps alternate; the model
+is updated after every batch:
 
-- *exploration*: the point with the largest expected improvement in the mean square of the residuals, over draws from
-  the model (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square instead (D. R.
-  Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to impossibly low values.
-  In many dimensions, this assumption would waste steps on the emptiest corner of the box;
+- *exploration*: the point with the largest expected improvement in the mean square of the residuals, computed from
+  draws of the residuals (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square
+  instead (D. R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to
+  impossibly low values. In many dimensions, this assumption would waste steps on the least explored corner of the box;
 - *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
   searches with exact derivatives of the model;
 - *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that the
   refinement of one basin does not prevent the exploration of the next.
 
-Input scales are estimated at every step up to `OFTEN` points, and then whenever the number of points has grown by a
-tenth. In between, points are only added to the model, which saves most of the computing time.
+Input scales are estimated at every step up to `OFTEN` points, and afterwards whenever the number of points has grown by
+a tenth. Between these estimates, points are only added to the model, which saves most of the computing time.
 
-In a batch, each candidate after the first is chosen as if the answers to the previous ones had equalled their
-predictions. A failed evaluation enters the model with the residuals of the worst successful one.
+In a batch, each candidate after the first is chosen as if the answers to the previous candidates had equalled the
+predictions. In the model, a failed evaluation has the residuals of the worst successful evaluation.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ from calibray.optimizers.sampling import (
 )
 
 FIRST = 5
-"""Largest number of points in the initial design minus the number of parameters."""
+"""Maximum difference between the number of points in the initial design and the number of parameters."""
 
 CANDIDATES = 600
-"""Number of candidates drawn over the whole box, and number drawn around the best points."""
+"""Number of candidates drawn over the whole box, and also the number drawn around the best points."""
 
 DRAWS = 256
 """Number of draws of the residuals for the expected improvement."""
@@ -64,19 +64,19 @@ SEARCHES = 16
 """Number of local searches on the model."""
 
 UNCERTAIN = 1e-3
-"""A predicted minimum is treated as another basin if its variance exceeds this share of the prior variance."""
+"""A predicted minimum is treated as another basin if its variance exceeds this fraction of the prior variance."""
 
 
 @final
 class VectorSurrogate(Optimizer):
-    """Surrogate of the residual vector. Uses residuals; 20 d evaluations by default.
+    """Surrogate of the residual vector. Uses residuals; takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        initial: Size of the initial design; the smaller of 2 (d + 1) and d + 5 if None. Points already passed to `tell`
-            are included; points closer together than half the design's spacing are counted as one point.
+        initial: Size of the initial design; if None, the smaller of 2 (d + 1) and d + 5. Points already passed to
+            `tell` are included, but points closer together than half the spacing of the design count as one point.
         batch: Number of candidates per batch after the initial design, for engines that run in parallel.
-        noisy: Whether the engine's answers are noisy; if so, the model smooths the answers instead of interpolating
+        noisy: Whether the engine's answers are noisy. If so, the model smooths the answers instead of interpolating
             them.
 
     Raises:
@@ -141,11 +141,12 @@ class VectorSurrogate(Optimizer):
             left, turn = left - count, turn + count
 
     def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The initial design [k, d] without the points that previous evaluations [n, d] replace."""
+        """The initial design [k, d] without the points that are replaced by previous evaluations [n, d]."""
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
         for point in earlier:
-            # Every evaluated point that is not close to one already counted replaces the nearest point of the design.
+            # An evaluated point replaces the nearest point of the design, unless it is close to a point already
+            # counted.
             clumped = len(counted) and distance_to_nearest(point[None], counted)[0] < spacing
             if len(points) and not clumped:
                 counted = np.vstack([counted, point])
@@ -153,7 +154,7 @@ class VectorSurrogate(Optimizer):
         return points
 
     def _fitted(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> Kriging:
-        """A model of all points, with new scales if the number of points has grown enough."""
+        """Fit a model to all points; the scales are estimated again if the number of points has grown enough."""
         if self._model is None:
             self._learned = len(points)
             return fit(points, residuals, noisy=self.noisy)
@@ -176,7 +177,7 @@ class VectorSurrogate(Optimizer):
             # The steps alternate: exploration, the lowest minimum, another basin.
             if step % 3 and len(fresh):
                 _, share = model.predict(fresh)
-                # argmax of the mask is the first uncertain minimum, or the lowest one if none is uncertain
+                # argmax of the mask is the first uncertain minimum, or the lowest minimum if none is uncertain
                 index = 0 if step % 3 == 1 else np.argmax(share > UNCERTAIN)
                 x = fresh[index]
             else:
@@ -193,11 +194,11 @@ class VectorSurrogate(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = not_evaluated(candidates, taken, SEPARATION)
-        # Multiplied by the root, these draws have the covariance of the residuals.
+        # Multiplied by `root`, these draws have the covariance of the residuals.
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
         mean, share = model.predict(candidates)
         gain = improvement(mean, share, normal @ model.root, best)
-        if not gain.any():  # no draw improves anywhere: take the point closest to improving
+        if not gain.any():  # if no draw is an improvement, take the point closest to an improvement
             centre, spread = mean_square(model, candidates)
             return candidates[np.argmax((best**2 - centre) / np.maximum(spread, 1e-300))]
         return candidates[np.argmax(gain)]
@@ -207,9 +208,9 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
     """Expectation and standard deviation [k] of the mean square Q of the residuals at points [k, d].
 
     Let r be the prediction and s^2 V the predictive covariance. V is the prior covariance of the residuals, and s^2
-    grows with the distance from evaluated points. Q then has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r +
-    2 s^4 tr V^2) / m^2. Errors of different links are correlated; treating them as independent would stop exploration
-    too early.
+    increases with the distance from evaluated points. Q then has the mean (r^T r + s^2 tr V) / m and the variance (4
+    s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of different links are correlated. If they were treated as independent,
+    exploration would stop too early.
     """
     mean, share = model.predict(x)
     root, links = model.root, model.root.shape[1]
@@ -223,9 +224,9 @@ def improvement(
 ) -> NDArray[np.float64]:
     """Expected improvement [k] in the mean square of the residuals over the best value, by Monte Carlo.
 
-    `mean` contains predictions [k, m], `share` their variances relative to the prior [k], and `draws` random vectors
-    with the prior covariance [n, m]. The result is 0 if no draw is an improvement. `best` is the lowest root mean
-    square so far.
+    `mean` contains the predictions [k, m], `share` contains their variances relative to the prior variances [k], and
+    `draws` contains random vectors with the prior covariance [n, m]. The result is 0 if no draw is an improvement.
+    `best` is the lowest root mean square so far.
     """
     # |r + s v|^2 = r.r + 2 s r.v + s^2 v.v for prediction r and draw v.
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)
@@ -234,6 +235,6 @@ def improvement(
 
 
 def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Local minima [k, d] of the predicted objective, lowest first, from starting points in the unit cube [s, d]."""
+    """Find local minima [k, d] of the predicted objective, lowest first, from starting points [s, d]."""
     ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
     return ends.unit[np.argsort(ends.cost, kind="stable")]

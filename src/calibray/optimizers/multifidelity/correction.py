@@ -1,25 +1,26 @@
-"""Correction of a cheap model until it agrees with the engine: first the constants, then the remaining discrepancy.
+"""Correction of a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
 
 *Input mapping*: the constants of the cheap model are set to the values that best explain the engine's answers. Errors
-are whitened with the covariance of the discrepancy, which is mostly an offset common to all points. A link's offset
-therefore does not distort the constants. The constants have a prior around their assumed values. This is implicit space
-mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378).
+are whitened with the covariance of the discrepancy. For each link, the discrepancy is mostly an offset common to all
+points, so whitening prevents this offset from distorting the constants. The constants have a prior around their assumed
+values. This method is known as implicit space mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE
+Trans. Microw. Theory Tech. 52 (2004) 378).
 *Output mapping*: `discrepancy.py` models the offset, the slope and the remainder.
 
 Slab resonances cause many minima. A kernel that was fitted with wrong constants attributes the resulting errors to the
 discrepancy and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
-constants, most of which differ from the present set in one or two constants. Each set is judged with the scale of the
-discrepancy that suits it best. Rounds alternate between the fitted kernel and the kernel at the mean of the prior. A
-round descends from the most likely sets and fits the kernel to the best results. It accepts a result only if it makes
-the answers more probable.
+constants, most of which differ from the current set in one or two constants. Each set is compared at its most probable
+scale of the discrepancy. Rounds alternate between the fitted kernel and the kernel at the mean of the prior. In a
+round, local searches start from the most likely sets, and the kernel is fitted again for the best results. A result is
+accepted only if it makes the answers more probable.
 
 A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
-well and predict minima at different points; the lowest of these predictions would be too optimistic. A corrected model
-is therefore averaged over members drawn from the posterior of the constants. Each member is corrected until it passes
-through all answers; where the members agree, the uncertainty is small. Members are drawn by randomised maximum
-likelihood: each is fitted from a different starting point, to answers and a prior that are both perturbed according to
-their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is compared with the
-errors of earlier predictions at points not yet used in a fit, and scaled accordingly.
+well but predict minima at different points. The lowest of these predictions would be too optimistic. Predictions are
+therefore averaged over ensemble members drawn from the posterior of the constants. Each member is corrected until it
+passes through all answers. The uncertainty is small where the members agree. Members are drawn by randomised maximum
+likelihood: each member is fitted from a different starting point, to answers and a prior that are both perturbed
+according to their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is scaled
+according to the errors of earlier predictions at points that were not yet used in a fit.
 """
 
 from __future__ import annotations
@@ -38,25 +39,25 @@ from calibray.optimizers.protocol import CheapModel, Constants
 from calibray.optimizers.regression import Inputs, Kernel, Process
 
 ROUNDS: Final = 4
-"""Largest number of rounds of an input mapping."""
+"""Maximum number of rounds of an input mapping."""
 
 GAINED: Final = 1.0
-"""Decrease in the negative log density below which a round is considered to have gained nothing."""
+"""Decrease in the negative log density below which a round counts as no improvement."""
 
 TRIALS: Final = 300
-"""Largest number of sets of constants tried in a round."""
+"""Maximum number of sets of constants tried in a round."""
 
 COMPARED: Final = 3000
-"""Largest product of the number of sets tried in a round and the number of answers."""
+"""Maximum product of the number of sets tried in a round and the number of answers."""
 
 FOLLOWED: Final = 4
-"""Number of best-fitting sets from which a round descends, in addition to the present set."""
+"""Number of best-fitting sets from which the searches of a round start, in addition to the current set."""
 
 REFITTED: Final = 2
 """Number of results of a round for which the kernel is fitted again."""
 
 STEPS: Final = 12
-"""Largest number of steps of an input mapping from one starting point."""
+"""Maximum number of steps of an input mapping from one starting point."""
 
 CONVERGED: Final = 1e-4
 """Relative decrease in cost, or step in the unit cube, below which an input mapping has converged."""
@@ -112,7 +113,7 @@ class Response:
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The r predicted columns of `rows` [k, m, ...], scaled so that responses have a mean squared norm of 1."""
+        """The r predicted columns of `rows` [k, m, ...], scaled so that the mean squared norm of the responses is 1."""
         return rows[:, self.known] / (self.scale * np.sqrt(max(int(self.known.sum()), 1)))
 
 
@@ -156,7 +157,7 @@ class Corrected:
         return cheap + self.discrepancy.mean(inputs), slope + self.discrepancy.slope(inputs, response_slope)
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
-        """Residuals [k, m] of the cheap model with adjusted constants, and the points with their responses."""
+        """Residuals [k, m] of the cheap model with the adjusted constants, and the points with their responses."""
         cheap = self.cheap.residuals(unit, self.constants)
         return cheap, self.response.inputs(unit, cheap)
 
@@ -172,14 +173,14 @@ class Corrected:
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
     def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
-        """Add a point of the unit cube [d] as if its evaluation had returned the given residuals [1, m]."""
+        """Add a point in the unit cube [d] as if its evaluation had returned the given residuals [1, m]."""
         unit, answers = np.vstack([self.unit, point]), np.vstack([self.residuals, residuals])
         cheap, inputs = self.base(unit)
         process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """The model with other constants [q] and a discrepancy through the same answers; the kernel is kept if None."""
+        """The model with other constants [q] and a discrepancy through the same answers; None keeps the kernel."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -197,8 +198,8 @@ def correct(
 ) -> Corrected:
     """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
 
-    The response of the cheap model is computed at the points of `cloud` [k, d]. The input mapping starts from the
-    constants of `before`, a model fitted to fewer points. `noisy` states whether the answers are noisy.
+    The response of the cheap model is computed at the points in `cloud` [k, d]. The input mapping starts from the
+    constants of `before`, a model that was fitted to fewer points. `noisy` states whether the answers are noisy.
     """
 
     def corrected(constants: NDArray[np.float64], guess: Corrected | None) -> Corrected:
@@ -214,7 +215,7 @@ def correct(
         fitted = [corrected(constants, best) for constants in _likelier(shaped, random)]
         present, best = best, min([best, *fitted], key=_own_misfit)
         idle = idle + 1 if _own_misfit(present) - _own_misfit(best) < GAINED else 0
-        # Two successive rounds, one with each kernel, gained nothing.
+        # Two successive rounds, one with each kernel, brought no improvement.
         if idle == 2:
             break
     return best
@@ -229,7 +230,7 @@ def with_discrepancy(
     noisy: bool = False,
     guess: Corrected | None = None,
 ) -> Corrected:
-    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides another initial kernel."""
+    """Fit only the discrepancy, with given constants [q]; see `correct`. `guess` provides a second initial kernel."""
     unit, residuals = answers
     response = Response.of(cheap.residuals(cloud, constants), cheap.model.known)
     base = cheap.residuals(unit, constants)
@@ -243,23 +244,24 @@ def with_discrepancy(
 
 
 def _own_misfit(corrected: Corrected) -> float:
-    """The misfit of a model's constants, computed with the model's kernel."""
+    """The misfit of a model's constants, computed with the model's own kernel."""
     return float(misfit(corrected, corrected.constants[None]).value[0])
 
 
 def constants_fit(
     corrected: Corrected, centre: NDArray[np.float64] | None = None, noise: NDArray[np.float64] | None = None
 ) -> Callable[[NDArray[np.float64]], Residuals]:
-    """The least-squares problem for the constants, with a fixed covariance of the discrepancy.
+    """The least-squares problem for the constants, given a fixed covariance of the discrepancy.
 
-    The prior is centred at `centre` [q], or at the cheap model's centre if None. `noise` [n m] perturbs the whitened
-    answers. Returns a function that maps constants, scaled to the unit cube by their bounds [s, q], to whitened errors
-    and their Jacobian. Half the sum of squared errors is the negative log density, up to a constant.
+    The prior is centred at `centre` [q], or at the centre of the cheap model's constants if `centre` is None. `noise`
+    [n m] perturbs the whitened answers. Returns a function that maps constants, which are scaled to the unit cube by
+    their bounds [s, q], to whitened errors and their Jacobian. Half the sum of squared errors is the negative log
+    density, up to a constant.
     """
     model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
     points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
     (count, links), size = corrected.residuals.shape, len(prior.centre)
-    # Errors are whitened over the points; the weights are inverse standard deviations of the residuals.
+    # Errors are whitened over the points. The weights are the inverse standard deviations of the residuals.
     whiten = np.linalg.inv(process.lower)
     weight = np.sqrt(process.precision)
     prior_slope = np.diag(width / prior.spread)
@@ -293,9 +295,9 @@ class Misfit(NamedTuple):
 
 
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
-    """The misfit of constants [s, q], given the discrepancy's kernel up to its scale.
+    """The misfit of constants [s, q], given the kernel of the discrepancy up to a scale factor.
 
-    The variances of the links are integrated out. A link that the present constants do not explain therefore keeps its
+    The variances of the links are integrated out. A link that the current constants do not explain therefore keeps its
     full weight for other constants.
     """
     model, prior = corrected.cheap.model, corrected.cheap.constants
@@ -309,7 +311,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
 
 
 def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """The best constants [k, q] from one round with the kernel of `corrected`."""
+    """Run one round with the kernel of `corrected`, and return the best constants [k, q]."""
     prior, present = corrected.cheap.constants, corrected.constants
     trials = np.vstack([present, _trials(corrected, random)])
     tried = misfit(corrected, trials)
@@ -325,24 +327,23 @@ def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.f
 
 
 def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """Sets of constants [s, q]; in each set, one, two or all constants are drawn from the prior."""
+    """Draw sets of constants [s, q]. In each set, one, two or all constants are drawn from the prior."""
     size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
     drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
     one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
-    # Sets alternate between one, two and all constants redrawn.
+    # In successive sets, one, two or all constants are redrawn in turn.
     number = np.arange(count)[:, None] % 3
     return np.where(one | (another & (number > 0)) | (number > 1), drawn, corrected.constants)
 
 
 UNLIKELY: Final = 30.0
-"""Excess in negative log density, divided by the number of constants plus 3, at which a member is omitted.
+"""Excess in negative log density, divided by the number of constants plus 3, above which a member is omitted.
 
-The limit is high because links share errors. The true posterior is therefore wider than this density, which assumes
-independent links.
+The limit is high because this density assumes independent links. Links share errors, so the true posterior is wider.
 """
 
 CAPPED: Final = 100.0
-"""Larger ratios of squared error to predicted variance are reduced to this value."""
+"""Maximum ratio of squared error to predicted variance; larger ratios are reduced to this value."""
 
 
 class Prediction(NamedTuple):
@@ -351,7 +352,7 @@ class Prediction(NamedTuple):
     Attributes:
         mean: Residuals, averaged over the members [k, m].
         variance: Predictive variance of a residual, averaged over the residuals [k].
-        members: For every member, its residuals [k, m] and its variance relative to `Corrected.root` [k].
+        members: For each member, the residuals [k, m] and the variance relative to `Corrected.root` [k].
     """
 
     mean: NDArray[np.float64]
@@ -364,7 +365,7 @@ class Averaged:
     """Corrected models that explain the same answers.
 
     Attributes:
-        members: The models, with the most likely one first.
+        members: The models; the most likely model comes first.
     """
 
     members: tuple[Corrected, ...]
@@ -380,7 +381,7 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point of the unit cube [d] as if its evaluation equalled the prediction; all members then agree."""
+        """Add a point in the unit cube [d] as if the prediction had been observed; all members then agree there."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
@@ -397,11 +398,11 @@ class ErrorRecord:
 
     @property
     def stretch(self) -> float:
-        """Factor that scales predicted variances; the prior is equivalent to one step with a ratio of 1."""
+        """Factor that scales predicted variances; the prior is equivalent to a single step with a ratio of 1."""
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:
-        """Add a step: predicted residuals [m], their averaged variance before scaling, and observed residuals [m]."""
+        """Add a step: predicted residuals [m], their mean variance before scaling, and observed residuals [m]."""
         ratio = float(np.mean((residuals - mean) ** 2)) / max(variance, 1e-12)
         self.ratios.append(min(ratio, CAPPED))
 

@@ -1,20 +1,20 @@
 """The discrepancy between an expensive model and a cheap one: a Gaussian process over the box for every residual.
 
-The discrepancy consists of an offset, a change in response and a remainder: v_0, v_1 and v_2 of `regression.py`. h(x)
-is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond similarly to the
-parameters, so paths that the cheap model lacks respond like those of other links. The v_1 term is the slope of a link's
-output mapping, so it also helps with links that the cheap model does not predict. Each residual has its own variance,
-which is integrated out with an inverse gamma prior. Links that the cheap model predicts badly therefore do not affect
-the others.
+The discrepancy consists of an offset, a change in response and a remainder, with the variances v_0, v_1 and v_2 of
+`regression.py`. h(x) is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond
+similarly to the parameters, so paths that the cheap model lacks respond like paths of other links. The v_1 term is the
+slope of a link's output mapping. It therefore also helps for links that the cheap model does not predict. Each residual
+has its own variance, which is integrated out with an inverse gamma prior. Links that the cheap model predicts poorly
+therefore do not affect other links.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
 The predictive variance describes each point separately, but errors at nearby points are nearly equal. Locating the
 possible minima of an uncertain function requires samples of whole functions. A function is drawn from the prior as a
-sum of the kernel's features with normal weights. A process through the differences between the answers and this
-function is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020,
-eq. 10). Features of the Matern kernel are cosines whose frequencies follow a t distribution with 5 degrees of freedom
-(A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
+sum of kernel features with normally distributed weights. A process that interpolates the differences between the
+answers and this function is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process
+posteriors, ICML 2020, eq. 10). Features of the Matern kernel are cosines whose frequencies follow a t distribution with
+5 degrees of freedom (A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ VARIANCE_SPREAD: Final = 2.0
 LOG_VARIANCE_BOUNDS: Final = (-14.0, 6.0)
 
 LENGTH: Final = 0.5
-"""Prior median of a length scale, as a share of the edge of the unit cube."""
+"""Prior median of a length scale, as a fraction of the edge of the unit cube."""
 
 LENGTH_SPREAD: Final = 0.7
 """Prior standard deviation of the logarithm of a length scale."""
@@ -55,7 +55,7 @@ LENGTH_SPREAD: Final = 0.7
 LOG_RATE_BOUNDS: Final = (-2.0, 4.0)
 
 NUGGET: Final = 1e-6
-"""Smallest nugget, relative to the mean square of the response; it keeps the matrix non-singular."""
+"""Smallest nugget, relative to the mean square of the response. The nugget keeps the matrix non-singular."""
 
 NOISE: Final = (float(np.log(1e-4)), 3.0)
 """Mean and standard deviation of the logarithm of the nugget if it is estimated."""
@@ -71,8 +71,8 @@ def fit(
 ) -> Process:
     """Fit the process to discrepancies [n, m], with the hyperparameters that have the largest posterior density.
 
-    The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy`, the nugget is also
-    estimated. `guess` is an additional starting point of the kernel search.
+    The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy` is true, the nugget
+    is also estimated. `guess` is an additional starting point of the kernel search.
     """
     likelihood = Likelihood(inputs, values, freedom=FREEDOM)
     prior = _prior(inputs.unit.shape[1], noisy)
@@ -80,7 +80,7 @@ def fit(
 
 
 def expected(dimension: int, scale: float, noisy: bool) -> Kernel:
-    """The kernel at the mean of the prior, for a response with the root mean square `scale`."""
+    """The kernel at the mean of the prior, for a response with a root mean square of `scale`."""
     return Kernel.of(_prior(dimension, noisy).mean, scale)
 
 
@@ -102,11 +102,12 @@ def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Proces
 
 
 def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Negative log density [s] of discrepancies [s, n, m] with the most probable scale, and that scale [s].
+    """Negative log density [s] of discrepancies [s, n, m] at the most probable scale, and this scale [s].
 
     Discrepancies are whitened by the inverse of the Cholesky factor of K. Each residual follows a multivariate t
-    distribution, whose covariance K is multiplied by the scale. The scale has the prior of a variance. Without a scale,
-    constants that explain the answers much better than the kernel expects would be only slightly more probable.
+    distribution, in which the covariance K is multiplied by the scale. The prior on the scale is that of a variance.
+    Without a scale, constants that explain the answers much better than the kernel predicts would be only slightly more
+    probable.
     """
     count, links = whitened.shape[-2:]
     square, scale = np.sum(whitened**2, axis=-2), np.ones(len(whitened))
@@ -150,7 +151,7 @@ class PriorDraw:
         return self.offset + at.response @ self.steepness + cosines @ self.amplitude
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives at points [k, m, d], given the derivatives of their responses [k, r, d]."""
+        """Derivatives at points [k, m, d], given the derivatives of the responses [k, r, d]."""
         sines = -np.sin(at.unit @ self.frequency.T + self.phase)[:, :, None] * self.frequency
         waves = np.einsum("kfd,fm->kmd", sines, self.amplitude, optimize=True)
         return waves + np.einsum("krd,rm->kmd", response_slope, self.steepness, optimize=True)
@@ -162,7 +163,7 @@ class SampledFunction:
 
     Attributes:
         prior: A draw from the prior.
-        rest: Process through the differences between the answers and the draw at the evaluated points.
+        rest: Process that interpolates the differences between the answers and the draw at the evaluated points.
     """
 
     prior: PriorDraw
@@ -173,12 +174,12 @@ class SampledFunction:
         return self.prior.values(at) + self.rest.mean(at)
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives [k, m, d] with respect to unit-cube coordinates, given those of the responses [k, r, d]."""
+        """Derivatives [k, m, d] in unit-cube coordinates, given the derivatives of the responses [k, r, d]."""
         return self.prior.slopes(at, response_slope) + self.rest.slope(at, response_slope)
 
 
 def sample_function(process: Process, random: np.random.Generator, stretch: float = 1.0) -> SampledFunction:
-    """Draw a function; `stretch` multiplies its deviations from the mean, so 0 gives the mean."""
+    """Draw a function; `stretch` multiplies its deviation from the mean, so a value of 0 gives the mean."""
     inputs, kernel = process.inputs, process.kernel
     (count, d), residuals = inputs.unit.shape, process.values.shape[1]
     size = stretch * np.sqrt(kernel.variances)
@@ -198,7 +199,7 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
         random.uniform(0.0, 2.0 * np.pi, COSINES),
         size[2] * np.sqrt(2.0 / COSINES) * correlated(COSINES),
     )
-    # The answers are the function plus errors, so a draw of the errors is subtracted too.
+    # The answers are the sum of the function and errors, so a draw of the errors is also subtracted.
     scatter = stretch * np.sqrt(kernel.nugget) * correlated(count)
     missed = process.values - prior.values(inputs) - scatter
     return SampledFunction(prior, solve(inputs, missed, kernel))

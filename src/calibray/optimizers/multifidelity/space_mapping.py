@@ -1,30 +1,30 @@
-"""Space mapping minimises an expensive model with the help of a cheap one, which is corrected after every call.
+"""Space mapping minimises an expensive model with the help of a cheap model, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
 The first call evaluates the minimum of this approximation. After every call, the cheap model is corrected until it
-agrees with all answers (`correction.py`). Many local searches then find its minima in all basins. There are two kinds
-of steps:
+agrees with all answers (`correction.py`). Many local searches then find the minima of the corrected model in all
+basins. There are two kinds of steps:
 
-- *exploitation*: of the minima of the corrected model within a trust region, the one with the lowest expected mean
-  square is evaluated; the expectation includes the uncertainty. The trust region is a box around the best point. It is
-  halved after a step without an improvement and doubled after a step with an improvement;
+- *exploitation*: of the minima of the corrected model within a trust region, the minimum with the lowest expected mean
+  square is evaluated. The expectation includes the uncertainty. The trust region is a box around the best point. Its
+  width is halved after a step without an improvement and doubled after a step with an improvement;
 - *exploration*: the point with the largest expected improvement over the whole box is evaluated. The improvement is
   computed from draws of the discrepancy, as in `vector_surrogate.py`. Minima of the corrected model in other basins are
-  among the candidates. An exploration follows an exploitation that gained almost nothing. It also replaces an
-  exploitation if there is no new minimum.
+  among the candidates. An exploration follows an exploitation that brought almost no improvement. An exploration also
+  replaces an exploitation if there is no new minimum.
 
-Both kinds account for constants that a few answers cannot determine, and for the errors of earlier predictions
-(`correction.py`). On synthetic districts, steps would otherwise jump across half the box to predicted minima that do
-not exist.
+Both kinds of steps account for constants that a few answers cannot determine, and for the errors of earlier predictions
+(`correction.py`). Otherwise, on synthetic districts, steps jump across half the box to predicted minima that do not
+exist.
 
 The cheap model is used only as long as it helps. Each point is predicted from all other points, once by the corrected
-model and once by the same process without a cheap model; `error_ratio` is the median over the links of the ratio of the
-two squared errors. The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`; later checks
-fail if it exceeds `MISLED`. After two failed checks in a row, the vector surrogate continues with all evaluations so
-far. If there is no cheap model, the vector surrogate runs from the first call. The median is used, because a few links
-dominate a sum over all links. Of twelve synthetic problems, eight had their own cheap model, and four had random
-sinusoids instead. After four calls, the ratio was at most 0.66 with the right model (in one case, it was 1.9 after
-three calls), and at least 1.01 with sinusoids.
+model and once by the same process without a cheap model. `error_ratio` is the median over the links of the ratio of the
+two squared errors. The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`. Later checks
+fail if the ratio exceeds `MISLED`. After two failed checks in a row, the vector surrogate continues with all
+evaluations so far. If there is no cheap model, the vector surrogate runs from the first call. The median is used
+because a few links dominate a sum over all links. Of twelve synthetic problems, eight had their own cheap model, and
+four had random sinusoids instead. After four calls, the ratio was at most 0.66 with the right model and at least 1.01
+with sinusoids. In one case with the right model, the ratio was 1.9 after three calls.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -63,39 +63,39 @@ SEARCHES: Final = 16
 """Number of local searches on each corrected model that start from Sobol points."""
 
 KEPT: Final = 8
-"""Largest number of local searches from each of three sets: earlier minima, best points, and random points in the trust
+"""Maximum number of local searches from each of three sets: earlier minima, best points, and random points in the trust
 region.
 """
 
 SEARCH_STEPS: Final = 30
-"""Largest number of steps of a local search on a model."""
+"""Maximum number of steps of a local search on a model."""
 
 CONVERGED: Final = 1e-6
 """Relative decrease in cost, or step in the unit cube, below which a local search has converged."""
 
 CANDIDATES: Final = 300
-"""Number of candidates drawn over the whole box, and number drawn around the best points."""
+"""Number of candidates drawn over the whole box, and also the number drawn around the best points."""
 
 DRAWS: Final = 512
 """Number of draws of the discrepancy for the expected improvement, in total over all members."""
 
 APART: Final = 0.003
-"""Distance in the unit cube below which two minima are considered to be the same."""
+"""Distance in the unit cube below which two minima are considered identical."""
 
 MEMBERS: Final = 8
-"""Largest number of models with other constants that are averaged with the corrected model in the first steps."""
+"""Maximum number of models with other constants that are averaged with the corrected model in the first steps."""
 
 AVERAGED: Final = 10
-"""Number of calls up to which predictions are averaged over these models."""
+"""Number of calls up to which predictions are averaged over the corrected model and up to `MEMBERS` other models."""
 
 SEPARATION: Final = 1e-3
 """Distance in the unit cube below which a point is considered already evaluated."""
 
 REACHES: Final = (0.02, 1.0)
-"""Smallest and largest half width of the trust region, in the unit cube."""
+"""Minimum and maximum half-width of the trust region in the unit cube."""
 
 GAINED: Final = 1e-3
-"""An exploration follows an exploitation that decreases the root mean square by less than this share."""
+"""An exploration follows an exploitation that decreases the root mean square by less than this fraction."""
 
 JUDGED: Final = 3
 """Number of calls after which checks of the cheap model begin."""
@@ -104,15 +104,16 @@ HELPFUL: Final = 0.8
 """Error ratio above which one of the first `DOUBTS` checks fails."""
 
 MISLED: Final = 2.0
-"""Error ratio above which a later check fails; by then, points are so close that any process predicts them well."""
+"""Error ratio above which a later check fails; at that stage, points are so close that any process predicts them
+well."""
 
 DOUBTS: Final = 2
-"""The cheap model is dropped after this many failed checks in a row; as many checks at the start use `HELPFUL`."""
+"""Number of successive failed checks after which the cheap model is dropped, and number of checks with `HELPFUL`."""
 
 
 @final
 class SpaceMapping(Optimizer):
-    """Space mapping. Uses residuals; 20 d evaluations by default.
+    """Space mapping. Uses residuals; takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
@@ -156,7 +157,7 @@ class SpaceMapping(Optimizer):
 
     @property
     def corrected(self) -> Corrected | None:
-        """The cheap model, corrected with all evaluations before the last step; None if it is not used."""
+        """The cheap model, corrected with all evaluations before the last step; None if no cheap model is used."""
         return self._corrected
 
     def _search(self, archive: Archive) -> Search:
@@ -206,7 +207,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """Minima of the uncorrected cheap model after the first `turn`, and then random points [count, d]."""
+        """Minima of the uncorrected cheap model, without the first `turn`, followed by random points [count, d]."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -217,7 +218,7 @@ class SpaceMapping(Optimizer):
         return np.vstack([self._minima[turn:], self._rng.random((count, d))])[:count]
 
     def _averaged(self, corrected: Corrected) -> Averaged:
-        """The corrected model and others that explain the answers; up to half of these start from previous members."""
+        """The corrected model and others that explain the answers; up to half of these start from earlier members."""
         prior = corrected.cheap.constants
         if len(corrected.residuals) > AVERAGED or not len(prior.centre):
             return Averaged((corrected,))
@@ -231,7 +232,7 @@ class SpaceMapping(Optimizer):
         """Record the errors of the predictions for the last batch."""
         for point, mean, variance in self._predicted:
             row = int(np.argmin(np.abs(unit - point).max(axis=1)))
-            if np.abs(unit[row] - point).max() < 1e-9:  # otherwise its evaluation failed
+            if np.abs(unit[row] - point).max() < 1e-9:  # otherwise the evaluation failed
                 self._errors.add(mean, variance, residuals[row])
 
     def _choose(self, model: Averaged, archive: Archive, count: int) -> NDArray[np.float64]:
@@ -248,7 +249,7 @@ class SpaceMapping(Optimizer):
         for index in range(count):
             fresh = self._minima[distance_to_nearest(self._minima, taken) > SEPARATION]
             within = fresh[np.abs(fresh - taken[0]).max(axis=1) <= self._reach]
-            # Exploitations and explorations alternate in a batch; after a stall, the batch begins with an exploration.
+            # Exploitations and explorations alternate in a batch. After a stall, the batch begins with an exploration.
             if (index % 2 == 1) == self._stalled and len(within):
                 expected = model.predict(within)
                 square = np.mean(expected.mean**2, axis=1) + self._errors.stretch * expected.variance
@@ -272,15 +273,16 @@ class SpaceMapping(Optimizer):
         prediction, gain = model.predict(candidates), np.zeros(len(candidates))
         draws = max(1, DRAWS // len(model.members))
         for member, (residuals, share) in zip(model.members, prediction.members, strict=True):
-            # Squared errors so far exceeded predicted variances by this factor, so deviations grow by its square root.
+            # So far, squared errors exceeded predicted variances by `stretch`, so deviations grow by the square root of
+            # `stretch`.
             mean = prediction.mean + np.sqrt(stretch) * (residuals - prediction.mean)
             normal = self._rng.standard_normal((draws, len(member.root)))
             gain += improvement(mean, stretch * share, normal @ member.root, best)
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """Resize the trust region after an exploitation, and explore once if the gain was too small."""
-        # The last step was an exploration, or no evaluation before it succeeded.
+        """Resize the trust region after an exploitation, and explore once if the improvement was too small."""
+        # The last step was an exploration, or no evaluation before the last step succeeded.
         if self._stalled or not np.isfinite(before):
             self._stalled = False
             return
@@ -291,12 +293,12 @@ class SpaceMapping(Optimizer):
 def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
     """Median over the links of the ratio of the squared errors with and without the cheap model.
 
-    Each of at least three points is predicted from all others. The cheap model helps if the ratio is below 1. `noisy`
-    states whether the answers are noisy, for the process without the cheap model.
+    Each of at least three points is predicted from all other points. The cheap model helps if the ratio is below 1.
+    `noisy` states whether the answers are noisy; it affects only the process without the cheap model.
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)
-    # The same kind of process, fitted to the answers themselves.
+    # The same kind of process is fitted to the answers themselves.
     alone = discrepancy.fit(Inputs.plain(corrected.unit), residuals, scale, noisy=noisy)
     with_it, without = (
         np.sum(process.left_out_errors() ** 2, axis=0) for process in (corrected.discrepancy, alone)
