@@ -39,7 +39,7 @@ INDEPENDENT: Final = 1e-3
 """Smallest pivot (see `_pivot`) for which a further point is included in the model (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""Share of the predicted decrease that a successful step achieves; after such a step, the region does not shrink."""
+"""Minimum fraction of the predicted decrease for a successful step; the region then does not shrink."""
 
 LARGEST: Final = 0.5
 """Maximum trust-region radius, as a fraction of the box width."""
@@ -47,7 +47,7 @@ LARGEST: Final = 0.5
 
 @final
 class POUNDERS(Optimizer):
-    """Derivative-free least squares with quadratic models. Uses residuals; spends the whole budget.
+    """Derivative-free least squares with quadratic models. The method uses residuals, and spends the whole budget.
 
     Args:
         seed: Seed of the random points at which searches restart.
@@ -252,7 +252,7 @@ def improving_point(
 
 @final
 class GaussNewton(Optimizer):
-    """Gauss-Newton least squares with finite differences. Uses residuals; spends the whole budget.
+    """Gauss-Newton least squares with finite differences. The method uses residuals, and spends the whole budget.
 
     Args:
         seed: Seed of the random points at which searches restart.

@@ -31,7 +31,7 @@ class Best:
 
 @dataclass(frozen=True)
 class Evaluations:
-    """Evaluations by the engine; `checked_evaluations` builds them from validated copies.
+    """Evaluations by the engine. Build them with `checked_evaluations`, which validates and copies the arrays.
 
     Attributes:
         x: Points [n, d].

@@ -26,11 +26,11 @@ CANDIDATES = 300
 
 @final
 class GaussianProcess(Optimizer):
-    """Bayesian optimization. Uses only objective values; takes 20 d evaluations by default.
+    """Bayesian optimization. The method uses only objective values, and takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
-        initial: Size of the initial design; 2 (d + 1) if None. Points already passed to `tell` are included.
+        initial: Size of the initial design; 2 (d + 1) if None. Points already passed to `tell` count towards this size.
 
     Raises:
         InputError: An argument is out of range.

@@ -3,8 +3,8 @@
 GWO: S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014. Where
 descriptions and common implementations differ, the following choices apply:
 
-- Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T). The move after the last
-  evaluation is omitted, so a run takes exactly N T evaluations.
+- Iteration t = 1..T evaluates the whole population, and then moves the population with a(t) = 2 (1 - t/T). The move
+  after the last evaluation is omitted, so a run takes exactly N T evaluations.
 - alpha, beta and delta are the three best *distinct* points of the whole run (not of the last generation), with ties in
   the order of evaluation. Wolves at the same point count as one leader.
 - Wolves always move, even to a worse position.
@@ -56,7 +56,7 @@ LEADERS = 3
 """Number of leaders: alpha, beta and delta."""
 
 WOLVES = 30
-"""Number of wolves, the paper's N (Table II)."""
+"""Number of wolves, N in the paper (Table II)."""
 
 LEAST_BUDGET = 24
 """Smallest budget of both methods. SGWO-IM then has three wolves, one for each leader, and uses the whole budget."""
@@ -65,7 +65,7 @@ FULL_ITERATIONS = 5
 """Number of iterations that evaluate all wolves (Table II)."""
 
 ELITES = 5
-"""Number of wolves evaluated in each later iteration, the paper's K (Table II)."""
+"""Number of wolves evaluated in each later iteration, K in the paper (Table II)."""
 
 SMOOTHING = 1e-6
 
@@ -85,7 +85,7 @@ def encircle(
     """Move a pack under the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
 
     `r1` and `r2` [n, 3, d] are independent uniform random numbers, and `leaders` contains alpha, beta and delta [3, d].
-    Returns X_GWO, the mean of the three guided positions [n, d], not yet clipped.
+    Returns X_GWO, the mean of the three guided positions [n, d], before clipping.
     """
     a_coefficient = 2.0 * a * r1 - a  # A, eq. 3.3
     c_coefficient = 2.0 * r2  # C, eq. 3.4
@@ -108,11 +108,11 @@ def whole_iterations(budget: int) -> dict[str, int]:
 
 @final
 class GWO(Optimizer):
-    """Grey Wolf Optimizer. Uses only objective values; takes 600 evaluations with the paper's settings.
+    """Grey Wolf Optimizer. The method uses only objective values, and takes 600 evaluations by default.
 
     Args:
-        population: N, number of wolves.
-        iterations: T, number of iterations.
+        population: Number of wolves, N.
+        iterations: Number of iterations, T.
 
     Raises:
         InputError: An argument is out of range.
@@ -190,13 +190,13 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
 @final
 class SGWOIM(Optimizer):
-    """The paper's optimizer. Uses only objective values; takes 225 evaluations with the paper's settings.
+    """The paper's optimizer. The method uses only objective values, and takes 225 evaluations by default.
 
     Args:
-        population: N, number of wolves.
-        iterations: T, number of iterations.
+        population: Number of wolves, N.
+        iterations: Number of iterations, T.
         full_iterations: Number of iterations that evaluate the whole population before the surrogate selects wolves.
-        elites: K, number of wolves evaluated in each later iteration.
+        elites: Number of wolves evaluated in each later iteration, K.
         w_min: Memory weight at the start of the run.
         w_max: Memory weight at the end of the run.
         convergence: "cosine" (the paper's eq. 2) or "linear" (standard GWO).

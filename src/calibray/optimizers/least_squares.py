@@ -8,9 +8,10 @@ with the best search is abandoned, and its last point is kept as another minimum
 well show how ambiguous the best minimum is. `descent.py` computes the steps.
 
 Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If there is a better
-minimum with an equally wide basin, the probability that all searches have missed this minimum is e^-k after k returns.
-If fewer searches end in the best minimum, all starting points are used. (The Bayesian rule of Boender and Rinnooy Kan,
-Mathematical Programming 37, 1987, counts the different minima, which requires every search to run to its end.)
+minimum with an equally wide basin, the probability that all searches have missed this minimum is e^-k after k returns
+to the best minimum. If fewer searches end in the best minimum, all starting points are used. (The Bayesian rule of
+Boender and Rinnooy Kan, Mathematical Programming 37, 1987, counts the different minima, which requires every search to
+run to its end.)
 
 If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
 start from the combinations that fit best, until no better minimum is found. If there is at least one full round of
@@ -37,7 +38,7 @@ from calibray.optimizers.sampling import design
 from calibray.support.messages import shortened
 
 CATCH_UP = 100.0
-"""A search is abandoned if its cost exceeds the lowest one by more than this multiple of its predicted decrease."""
+"""A search is abandoned if its cost exceeds the lowest cost by more than this multiple of its predicted decrease."""
 
 NEARER = 10.0
 """Value of `CATCH_UP` for searches from combined minima, which start close to the minima that they reach."""
@@ -82,7 +83,7 @@ APART = 0.01
 
 @final
 class LeastSquares(Optimizer):
-    """Multi-start Levenberg-Marquardt. Uses residuals and Jacobians; it has no budget and stops by itself.
+    """Multi-start Levenberg-Marquardt. The method uses residuals and Jacobians, and stops on its own, without a budget.
 
     Args:
         seed: Seed of basin hopping and of the scrambled Sobol points from which searches start.

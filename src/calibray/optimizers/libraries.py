@@ -38,11 +38,11 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; this is not an `Exception`, because a library might catch it."""
+    """Error that ends a minimiser whose search was dropped; a library might catch an error derived from `Exception`."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
-    """Run a minimiser in a thread, and yield the candidates [n, d] whose evaluations it requests.
+    """Run a minimiser in a thread, and yield the candidates [n, d] for which the minimiser requests evaluations.
 
     Raises:
         Exception: Any exception that `minimise` raises.
@@ -81,7 +81,9 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. Uses only objective values; spends the whole budget. Needs `calibray[optimizers]`.
+    """Covariance matrix adaptation. The method uses only objective values, and spends the whole budget.
+
+    The method requires `calibray[optimizers]`.
 
     Args:
         budget: Number of evaluations.
@@ -133,7 +135,9 @@ class CMAES(Optimizer):
 
 @final
 class DFOLS(Optimizer):
-    """Derivative-free least squares. Uses residuals; spends the whole budget. Needs `calibray[optimizers]`.
+    """Derivative-free least squares. The method uses residuals, and spends the whole budget.
+
+    The method requires `calibray[optimizers]`.
 
     Args:
         seed: Seed of the random points at which searches restart.
@@ -168,7 +172,7 @@ class DFOLS(Optimizer):
         self._session = Session(self.box, self.uses, self._search, objective)
 
     def _search(self, archive: Archive) -> Search:
-        # The thread holds no reference to this object, so it ends when this object is dropped.
+        # The thread holds no reference to this object, so the thread ends when this object is dropped.
         solve, radii = self._dfols.solve, (self.radius, self.tolerance)
         minimise = partial(_minimise_residuals, solve, radii, self._budget, archive, self._rng)
         return limited(inverted(minimise), self._budget)
@@ -210,7 +214,7 @@ def _minimise_residuals(
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. Uses only objective values; spends the whole budget.
+    """Differential evolution. The method uses only objective values, and spends the whole budget.
 
     Args:
         budget: Number of evaluations.
@@ -230,7 +234,7 @@ class DifferentialEvolution(Optimizer):
         self._session = Session(self.box, self.uses, self._search)
 
     def _search(self, archive: Archive) -> Search:
-        # The thread holds no reference to this object, so it ends when this object is dropped.
+        # The thread holds no reference to this object, so the thread ends when this object is dropped.
         minimise = partial(_evolve, self.population, archive, self._rng)
         return limited(inverted(minimise), self._budget)
 

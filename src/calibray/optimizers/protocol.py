@@ -157,7 +157,7 @@ AS_GIVEN: Final = Schedule(lambda budget: {"budget": budget})
 
 
 class Optimizer(ABC):
-    """Minimises a function over a box; the caller runs the loop.
+    """A method that minimises a function over a box; the caller runs the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
     settings in the constructor and passes its algorithm to a `Session`. It sets the attributes below whose defaults do
@@ -174,7 +174,7 @@ class Optimizer(ABC):
 
     Attributes:
         uses: The parts of an evaluation that the method uses: "value", "residuals", "jacobian".
-        schedule: Schedule with which the method respects a budget; None if the method stops by itself.
+        schedule: Schedule with which the method respects a budget; None if the method stops on its own.
         takes_starts: Whether the constructor takes starting points (`x0`) and the number of further starting points
             (`starts`). Most methods also use the points passed to `tell` before the first `ask`.
     """
@@ -183,7 +183,7 @@ class Optimizer(ABC):
     schedule: ClassVar[Schedule | None] = AS_GIVEN
     takes_starts: ClassVar[bool] = False
     _session: Session
-    _budget: Any  # int, or None if the method stops by itself
+    _budget: Any  # int, or None if the method stops on its own
 
     @classmethod
     def needs_derivatives(cls) -> bool:

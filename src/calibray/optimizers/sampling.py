@@ -39,7 +39,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """Draw `tries` Latin hypercubes [count, dimension]; return that with the largest minimum point distance."""
+    """Draw `tries` Latin hypercubes [count, dimension], and return the one with the largest minimum spacing."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -69,7 +69,7 @@ def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> 
 def not_evaluated(
     candidates: NDArray[np.float64], points: NDArray[np.float64], separation: float
 ) -> NDArray[np.float64]:
-    """The candidates [k, d] farther than `separation` from all evaluated points [n, d], but at least the farthest."""
+    """The candidates [k, d] farther than `separation` from all evaluated points [n, d]; if none, the farthest one."""
     distance = distance_to_nearest(candidates, points)
     return candidates[distance > min(separation, np.nextafter(distance.max(), -np.inf))]
 
@@ -102,7 +102,7 @@ class Sampling(Optimizer):
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. Uses only objective values; spends the whole budget.
+    """Independent uniform points. The method uses only objective values, and spends the whole budget.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -114,7 +114,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. Uses only objective values; spends the whole budget.
+    """One point in each slice of every dimension. The method uses only objective values, and spends the whole budget.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -126,7 +126,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. Uses only objective values; spends the whole budget.
+    """A scrambled Sobol sequence. The method uses only objective values, and spends the whole budget.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

@@ -8,13 +8,13 @@ A run begins with a maximin Latin hypercube. The design needs few points even fo
 be modelled as soon as the points determine a linear trend. After the design, three kinds of steps alternate; the model
 is updated after every batch:
 
-- *exploration*: the point with the largest expected improvement in the mean square of the residuals, computed from
+- *Exploration*: the point with the largest expected improvement in the mean square of the residuals, computed from
   draws of the residuals (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square
   instead (D. R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to
-  impossibly low values. In many dimensions, this assumption would waste steps on the least explored corner of the box;
-- *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
-  searches with exact derivatives of the model;
-- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that the
+  impossibly low values. In many dimensions, this assumption would waste steps on the least explored corner of the box.
+- *Exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
+  searches with exact derivatives of the model.
+- *Another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that the
   refinement of one basin does not prevent the exploration of the next.
 
 Input scales are estimated at every step up to `OFTEN` points, and afterwards whenever the number of points has grown by
@@ -69,12 +69,13 @@ UNCERTAIN = 1e-3
 
 @final
 class VectorSurrogate(Optimizer):
-    """Surrogate of the residual vector. Uses residuals; takes 20 d evaluations by default.
+    """Surrogate of the residual vector. The method uses residuals, and takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
         initial: Size of the initial design; if None, the smaller of 2 (d + 1) and d + 5. Points already passed to
-            `tell` are included, but points closer together than half the spacing of the design count as one point.
+            `tell` count towards this size, but points closer together than half the spacing of the design count as one
+            point.
         batch: Number of candidates per batch after the initial design, for engines that run in parallel.
         noisy: Whether the engine's answers are noisy. If so, the model smooths the answers instead of interpolating
             them.

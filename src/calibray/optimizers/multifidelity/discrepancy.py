@@ -1,4 +1,4 @@
-"""The discrepancy between an expensive model and a cheap one: a Gaussian process over the box for every residual.
+"""The discrepancy between an expensive and a cheap model: a Gaussian process over the box for every residual.
 
 The discrepancy consists of an offset, a change in response and a remainder, with the variances v_0, v_1 and v_2 of
 `regression.py`. h(x) is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond
@@ -69,7 +69,7 @@ def fit(
     noisy: bool = False,
     guess: Kernel | None = None,
 ) -> Process:
-    """Fit the process to discrepancies [n, m], with the hyperparameters that have the largest posterior density.
+    """Fit the process to discrepancies [n, m], with the most probable hyperparameters.
 
     The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy` is true, the nugget
     is also estimated. `guess` is an additional starting point of the kernel search.

@@ -5,10 +5,10 @@ The first call evaluates the minimum of this approximation. After every call, th
 agrees with all answers (`correction.py`). Many local searches then find the minima of the corrected model in all
 basins. There are two kinds of steps:
 
-- *exploitation*: of the minima of the corrected model within a trust region, the minimum with the lowest expected mean
+- *Exploitation*: of the minima of the corrected model within a trust region, the minimum with the lowest expected mean
   square is evaluated. The expectation includes the uncertainty. The trust region is a box around the best point. Its
-  width is halved after a step without an improvement and doubled after a step with an improvement;
-- *exploration*: the point with the largest expected improvement over the whole box is evaluated. The improvement is
+  width is halved after a step without an improvement and doubled after a step with an improvement.
+- *Exploration*: the point with the largest expected improvement over the whole box is evaluated. The improvement is
   computed from draws of the discrepancy, as in `vector_surrogate.py`. Minima of the corrected model in other basins are
   among the candidates. An exploration follows an exploitation that brought almost no improvement. An exploration also
   replaces an exploitation if there is no new minimum.
@@ -113,7 +113,7 @@ DOUBTS: Final = 2
 
 @final
 class SpaceMapping(Optimizer):
-    """Space mapping. Uses residuals; takes 20 d evaluations by default.
+    """Space mapping. The method uses residuals, and takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
