@@ -126,7 +126,7 @@ def test_whatever_breaks_the_reading_of_parquet_is_told(tmp_path, monkeypatch):
 
     (tmp_path / "links.parquet").write_bytes(b"PAR1")
     monkeypatch.setattr(pd, "read_parquet", break_off)
-    with pytest.raises(InputError, match=r"links\.parquet: not a Parquet file"):
+    with pytest.raises(InputError, match=r"links\.parquet: the file is not a Parquet file"):
         read_table(tmp_path / "links.parquet")
 
 

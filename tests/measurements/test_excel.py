@@ -90,7 +90,9 @@ def test_rows_out_of_order_are_refused(tmp_path, row):
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in parts.items():
             archive.writestr(name, content)
-    with pytest.raises(InputError, match=r"links\.xlsx: not an Excel file \(row '.*' follows row 2\)"):
+    with pytest.raises(
+        InputError, match=r"links\.xlsx: the file is not an Excel file \(row '.*' follows row 2\)"
+    ):
         read_table(path)
 
 

@@ -25,7 +25,7 @@ _DEVICES: Final = (
 """Regular expression for words that mean a receiving device in English, German, Spanish, French and Italian."""
 
 PATTERNS: Final = {
-    # The possible contents of a column, and the regular expression that a whole word of its name must match.
+    # The possible contents of a column, and the regular expression that a whole word of the name must match.
     "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[enp]?ci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
     r"basestation|anchor|beacon|gateway|gw|sender|basisstation|((mobil)?funk)?zelle|celda|cellule|cella|celula|emisor|"
     r"transmisor|emetteur|trasmettitore|estacion|station|stazione",
@@ -169,7 +169,7 @@ def matches(name: object, *rows: str) -> bool:
 
 
 def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Find a column of round-trip times or times of flight, and determine its kind and unit; None if there is none.
+    """Find a column of round-trip times or times of flight, with its kind and unit; None if there is no such column.
 
     Some Wi-Fi devices report a distance in metres instead of a time.
 

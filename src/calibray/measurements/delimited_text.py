@@ -41,7 +41,7 @@ class _Layout:
     """Layout of a text table.
 
     Attributes:
-        separator: Column separator; a space stands for any spaces and tabs.
+        separator: Column separator; a space stands for any sequence of spaces and tabs.
         skipped: Number of lines above the header.
         units: Unit of each column, from the row below the header; empty if this row contains no units.
         unit_lines: Indices of the first line of the row of units and of the line after it, counted from the header.
@@ -64,7 +64,9 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     if raw.startswith(b"PK\x03\x04"):
-        raise InputError(f"{path}: a ZIP archive or an Excel file; unpack it, or name the Excel file .xlsx")
+        raise InputError(
+            f"{path}: the file is a ZIP archive or an Excel file; unpack it, or name the Excel file .xlsx"
+        )
     encoding = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     # Without a byte order mark, the zero bytes of the first letters indicate UTF-16 and its byte order.
     if raw[:2].count(0) == raw[2:4].count(0) == 1:

@@ -13,7 +13,7 @@ from calibray.errors import InputError
 from calibray.materials import FREQUENCIES
 from calibray.measurements.placement import position_columns
 from calibray.measurements.source_table import SourceTable
-from calibray.support.messages import first_line, shortened
+from calibray.support.messages import counted, first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
@@ -53,7 +53,7 @@ class Measurements:
         >>> len(links), links.distance.tolist()
         (1, [50.0])
         >>> links
-        <1 measured links from links>
+        <1 measured link from links>
     """
 
     tx: NDArray[np.float64]
@@ -70,7 +70,7 @@ class Measurements:
         count = np.shape(self.path_loss_db)[0] if np.ndim(self.path_loss_db) == 1 else 0
         if count < 1:
             raise InputError(
-                f"path_loss_db: shape {np.shape(self.path_loss_db)}, must be [links] with at least one link"
+                f"path_loss_db: shape {np.shape(self.path_loss_db)}; it must be [links] with at least one link"
             )
         if self.weight is None:
             object.__setattr__(self, "weight", np.ones(count))
@@ -93,7 +93,7 @@ class Measurements:
         if self.table is None:
             object.__setattr__(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
-            raise InputError(f"table: {len(self.table)} rows, must be {count}, one per link")
+            raise InputError(f"table: {len(self.table)} rows; it must have one row per link ({count})")
         _check_links(self)
 
     def __len__(self) -> int:
@@ -102,7 +102,7 @@ class Measurements:
     def __repr__(self) -> str:
         kind = "measured" if self.measured else "unmeasured"
         groups = "" if self.group is None else f" in groups {named(self.group_names)}"
-        return short_text(f"<{len(self)} {kind} links{groups} from {self.source}>")
+        return short_text(f"<{counted(len(self), f'{kind} link')}{groups} from {self.source}>")
 
     def _repr_html_(self) -> str:
         return short_html(_summary(self))
@@ -169,7 +169,7 @@ class Measurements:
         chosen = np.asarray(mask)
         if chosen.dtype != np.bool_ or chosen.shape != (len(self),):
             raise InputError(
-                f"mask: {chosen.dtype} of shape {chosen.shape}, must be bool of shape ({len(self)},)"
+                f"mask: {chosen.dtype} of shape {chosen.shape}; it must be bool of shape ({len(self)},)"
             )
         if not chosen.any():
             raise InputError(f"{self.source}: the selection contains none of the {len(self)} links")

@@ -141,7 +141,7 @@ def _read_gpx(path: Path) -> pd.DataFrame:
         raise InputError(f"track {path}: does not exist; check the path") from None
     except UnicodeDecodeError as error:
         raise InputError(
-            f"track {path}: not UTF-8 text ({error.reason}); export the track as GPX again"
+            f"track {path}: the file is not UTF-8 text ({error.reason}); export the track as GPX again"
         ) from None
     # A GPX track needs no document type, and entities could expand until memory is exhausted.
     if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -151,14 +151,16 @@ def _read_gpx(path: Path) -> pd.DataFrame:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputError(f"track {path}: not well-formed XML ({error}); export the track again") from None
+        raise InputError(
+            f"track {path}: the file is not well-formed XML ({error}); export the track again"
+        ) from None
     rows = [_point(path, element) for element in root.iter() if _tag(element) == "trkpt"]
     points = pd.DataFrame(rows, columns=["time", "longitude", "latitude"]).dropna(subset=["time"])
     if points.empty:
         raise InputError(f"track {path}: no track point has a time; export the track, not a route")
     try:
         points["time"] = pd.to_datetime(points["time"], utc=True, format="ISO8601")
-        # pandas reads years before 1678 and after 2262, but cannot subtract them.
+        # pandas reads times in years before 1678 and after 2262, but cannot subtract these times.
         _seconds(points["time"])
     except (ValueError, OverflowError) as error:
         raise InputError(

@@ -199,7 +199,7 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
 
 
 def _carriers(table: SourceTable, column: str | None) -> NDArray[np.float64] | None:
-    """Carrier frequencies [rows], [Hz], from a column in hertz or in the unit stated in its name; None without one."""
+    """Carrier frequencies [rows], [Hz], from a column in hertz or in the unit stated in its name; None if no column."""
     if column is None:
         return None
     return table.numbers(column) * column_names.find_frequency_unit(column)

@@ -66,7 +66,8 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
     """Apply the other steps of `select_rows`, which complete the rows and leave out rows without a usable value."""
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
-        # If there is a noise floor, a missing power was too weak to measure. Otherwise, it carries no information.
+        # If there is a noise floor, a missing power was too weak to measure. Otherwise, a missing power carries no
+        # information.
         if steps.noise_floor_dbm is None and coded.any():
             if coded.all():
                 raise InputError(
@@ -77,7 +78,7 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
         if name not in table.frame:
             continue
         numbers = _numbers(table.frame[name])
-        # -1 dB is a valid K-factor, so only numbers of large magnitude are codes, except among times of flight.
+        # A K-factor of -1 dB is valid, so only numbers of large magnitude count as codes, except in times of flight.
         smallest = 0.0 if name in steps.flights else LARGEST_LEVEL
         found = [code for code in find_codes(numbers, np.inf) if abs(code) >= smallest]
         coded = np.isin(numbers, [*found, *steps.missing])
@@ -154,7 +155,7 @@ def plain_labels(column: Iterable[object]) -> list[str]:
 
 
 def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
-    """Choose how names are normalized for comparison: by `plain_labels`, or by `str` if two names became equal."""
+    """Choose how to normalize names for comparison: `plain_labels`, or `str` if `plain_labels` merges two names."""
     texts = list(map(str, names))
     if len(set(plain_labels(texts))) == len(set(texts)):
         return plain_labels

@@ -60,7 +60,9 @@ def sheet_text(path: Path) -> tuple[list[int], str]:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{path}: not an Excel file ({first_line(error)}); save it again") from None
+        raise InputError(
+            f"{path}: the file is not an Excel file ({first_line(error)}); save it again"
+        ) from None
     table = _below_header(path, sorted(rows.items()))
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(
@@ -93,8 +95,8 @@ def _check_row_order(path: Path, sheet: bytes) -> None:
         # An Excel sheet has at most 2^20 rows.
         if not previous < number <= 1_048_576:
             raise InputError(
-                f"{path}: not an Excel file (row {shortened(text.decode(errors='replace'))!r} follows row {previous}); "
-                "save it again"
+                f"{path}: the file is not an Excel file (row {shortened(text.decode(errors='replace'))!r} follows "
+                f"row {previous}); save it again"
             )
         previous = number
 
@@ -184,7 +186,7 @@ try:
 except MemoryError:
     refuse("the content takes more memory than the file declares; export the file again")
 except Exception as error:
-    refuse("not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
+    refuse("the file is not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
 """
 
 _METADATA: Final = """
@@ -197,7 +199,7 @@ try:
             for index in range(group.num_columns):
                 group.column(index).statistics
 except Exception as error:
-    refuse("not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
+    refuse("the file is not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
@@ -341,8 +343,8 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
     """Decode a Parquet file in a separate process with limits, because the content can be larger than declared.
 
     Pages can be larger than declared, and many rows can repeat one text. `size` is the declared size, and `limit` is
-    the maximum size of the rows in memory, both in bytes. The limit applies to the table if `whole`, and otherwise to
-    each piece.
+    the maximum size of the rows in memory, both in bytes. If `whole` is true, the limit applies to the table;
+    otherwise, the limit applies to each piece.
 
     Raises:
         InputError: The file requires too much memory or time, or is damaged.
@@ -433,4 +435,4 @@ def _damaged(path: Path, error: Exception) -> InputError:
     """The error for a Parquet file that pyarrow cannot read."""
     if isinstance(error, MemoryError):
         return InputError(f"{path}: does not fit into memory; keep only the required columns and rows")
-    return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")
+    return InputError(f"{path}: the file is not a Parquet file ({first_line(error)}); export it again")

@@ -91,8 +91,8 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
     """Find the column that contains transmitter names in both tables; None if there is no such column.
 
     The values of this column are distinct in the table of transmitters. The first column that contains all values of
-    the links is chosen. If there is none, the first column is chosen whose name indicates a transmitter and that shares
-    a value with the links.
+    the links is chosen. If no column contains all these values, the first column is chosen that shares a value with the
+    links and has a name that indicates a transmitter.
     """
     partial = None
     for name in transmitters:
@@ -196,7 +196,7 @@ POWERS: Final = (-30.0, 100.0)
 
 
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
-    """Find the columns of azimuth, mechanical and electrical downtilt, by key of ``[links.tx_antenna]``.
+    """Find the columns of azimuth, mechanical and electrical downtilt, by their keys in ``[links.tx_antenna]``.
 
     A downtilt column without a stated kind is treated as mechanical. Columns with the sum of both tilts are ignored. If
     the rows are not transmitters, the column names must indicate a transmitter or an antenna.
@@ -275,7 +275,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Find the column of EIRP or, failing that, of transmitted power [dBm]; the key is that in ``[links]``."""
+    """Find the column of EIRP or, failing that, of transmitted power [dBm], by its key in ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)
