@@ -201,7 +201,7 @@ def test_malformed_evaluations_are_refused_and_nothing_is_kept(arguments, messag
 def test_the_number_of_links_may_not_change():
     optimizer = LeastSquares(LANDSCAPE.lower, LANDSCAPE.upper)
     optimizer.tell(ONE, [1.0], [[1.0]], [[[1.0, 1.0]]])
-    with pytest.raises(InputError, match="residuals have 2 columns, but earlier ones had 1"):
+    with pytest.raises(InputError, match="residuals have 2 columns, but earlier residuals had 1"):
         optimizer.tell(ONE, [1.0], [[1.0, 1.0]], [[[1.0, 1.0], [1.0, 1.0]]])
 
 

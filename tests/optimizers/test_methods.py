@@ -42,7 +42,7 @@ def test_every_budget_from_the_smallest_on_is_kept(name, kind):
         used = make(name, *BOX, budget=budget).budget
         full = 30 if kind is GWO else 5 if kind is SGWOIM else 1
         assert budget - full < used <= budget
-    with pytest.raises(InputError, match=f"budget = .*needs at least {kind.schedule.least} evaluations"):
+    with pytest.raises(InputError, match=f"budget = .*needs at least {kind.schedule.least} evaluation"):
         make(name, *BOX, budget=kind.schedule.least - 1)
 
 

@@ -179,7 +179,7 @@ def test_a_missing_file_or_angle_is_named(scene, tmp_path, files):
     gap = SECTORS.assign(Azimuth=[20.0, None], MTilt=[2.0, 200.0])
     found = drafted(scene, tmp_path, gap)
     reasons = {each.what: each.reason for each in found.assumptions}
-    assert "1 of 2 rows have no number" in reasons["links.tx_antenna.azimuth_deg"]
+    assert "no number in 1 of 2 rows" in reasons["links.tx_antenna.azimuth_deg"]
     assert "200 is not an angle" in reasons["links.tx_antenna.downtilt_deg"]
     assert found.study.links.tx_antenna.azimuth_deg is None
 

@@ -17,7 +17,7 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.measurements.source_table import SourceTable
-from calibray.support.messages import shortened
+from calibray.support.messages import counted, shortened
 
 SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
 """File extensions of text tables."""
@@ -312,7 +312,8 @@ def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], 
             ends.add(len(cells) - len(header))
             if len(ends) > 1 or ends - {0, 1} or (1 in ends and cells[-1].strip()):
                 raise InputError(
-                    f"{path}, row {line}: {len(cells)} cells, but the header has {len(header)}; correct the row"
+                    f"{path}, row {line}: {counted(len(cells), 'cell')}, but the header has "
+                    f"{len(header)}; correct the row"
                 )
             lines.append(line)
     except csv.Error as error:

@@ -172,7 +172,7 @@ class Measurements:
                 f"mask: {chosen.dtype} of shape {chosen.shape}; it must be bool of shape ({len(self)},)"
             )
         if not chosen.any():
-            raise InputError(f"{self.source}: the selection contains none of the {len(self)} links")
+            raise InputError(f"{self.source}: the selection contains no links (out of {len(self)})")
         return Measurements(
             tx=self.tx[chosen],
             rx=self.rx[chosen],

@@ -55,7 +55,7 @@ def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTab
         mask = table.where(steps.where)
         if not mask.any():
             raise InputError(
-                f"{table.source}: where = {shortened(steps.where)!r} selects none of {len(table)} rows; change the "
+                f"{table.source}: where = {shortened(steps.where)!r} selects no rows (out of {len(table)}); change the "
                 "filter"
             )
         table = table.select(mask)

@@ -238,9 +238,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.boo
     values = pd.to_numeric(frame[column], errors="coerce")
     missing = len(frame) if values.isna().all() else int(lacking.sum())
     if missing or column not in numeric_columns(frame):
-        return (
-            f"{missing or len(frame)} of {len(frame)} rows have no number; add the numbers and state the key"
-        )
+        return f"no number in {missing or len(frame)} of {len(frame)} rows; add the numbers and state the key"
     if values.abs().max() > LARGEST_ANGLE[key]:
         return f"the value {values.abs().max():g} is not an angle in degrees"
     return ""

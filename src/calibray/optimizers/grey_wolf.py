@@ -51,6 +51,7 @@ from calibray.errors import InputError
 from calibray.optimizers.arguments import Box, choice, real, whole
 from calibray.optimizers.evaluations import Archive, Evaluations, merge_repeated, read_only
 from calibray.optimizers.protocol import Optimizer, Schedule, Search, Session
+from calibray.support.messages import counted
 
 LEADERS = 3
 """Number of leaders: alpha, beta and delta."""
@@ -235,7 +236,7 @@ class SGWOIM(Optimizer):
         samples, d = self.population * self.full_iterations, self.box.dimension
         if surrogate and samples <= d:
             raise InputError(
-                f"population * full_iterations = {samples} samples; a surrogate of {d} parameters needs at "
+                f"population * full_iterations = {samples} samples; a surrogate of {counted(d, 'parameter')} needs at "
                 f"least {d + 1}: raise the budget, population or full_iterations"
             )
         full = min(self.full_iterations, self.iterations) if surrogate else self.iterations

@@ -27,6 +27,7 @@ from calibray.optimizers.evaluations import (
     checked_evaluations,
     root_mean_square,
 )
+from calibray.support.messages import counted
 
 Search = Generator[NDArray[np.float64], Evaluations, None]
 """An algorithm, which yields candidates [n, d] inside the box and receives their evaluations in the same order."""
@@ -74,7 +75,9 @@ class Session:
         """See `Optimizer.ask`."""
         self._advance()
         if self._asked is None:
-            raise InputError(f"done after {len(self.archive)} evaluations; start a new optimizer to continue")
+            raise InputError(
+                f"done after {counted(len(self.archive), 'evaluation')}; start a new optimizer to continue"
+            )
         return self._asked[self._open]
 
     def tell(
@@ -91,7 +94,8 @@ class Session:
             links = evaluations.residuals.shape[1]
             if self._links not in (None, links):
                 raise InputError(
-                    f"residuals have {links} columns, but earlier residuals had {self._links}; pass the same links"
+                    f"residuals have {counted(links, 'column')}, but earlier residuals had "
+                    f"{self._links}; pass the same links"
                 )
             if self._objective is not root_mean_square:
                 check_order(evaluations, self.archive)
@@ -201,7 +205,8 @@ class Optimizer(ABC):
             return {}
         if budget < cls.schedule.least:
             raise InputError(
-                f"budget = {budget}; {cls.__name__} needs at least {cls.schedule.least} evaluations: raise the budget"
+                f"budget = {budget}; {cls.__name__} needs at least "
+                f"{counted(cls.schedule.least, 'evaluation')}: raise the budget"
             )
         return cls.schedule.settings(budget)
 
