@@ -232,7 +232,7 @@ def test_there_is_no_best_before_the_first_evaluation():
         ([0.0], [INF], r"upper\[0\] = inf; the bounds must be finite"),
         ([NAN], [1.0], r"lower\[0\] = nan"),
         ([0.0], [1.0, 2.0], r"lower has shape \(1,\) and upper \(2,\)"),
-        ([], [], r"d >= 1"),
+        ([], [], r"at least one entry"),
         (0.0, 1.0, "both must be vectors"),
     ],
 )

@@ -77,7 +77,7 @@ class Box:
         if low.ndim != 1 or low.shape != high.shape or low.size == 0:
             raise InputError(
                 f"lower has shape {low.shape} and upper {high.shape}; "
-                "both must be vectors with one entry for each parameter"
+                "both must be vectors of the same length, with at least one entry"
             )
         for number, (a, b) in enumerate(zip(low, high, strict=True)):
             if not (np.isfinite(a) and np.isfinite(b) and a < b):
