@@ -484,7 +484,7 @@ def test_different_places_moved_to_one_corner_both_stay():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tx": [[0, 0]]}, r"tx: shape \(1, 2\), must be \(1, 3\)"),
+        ({"tx": [[0, 0]]}, r"tx: shape \(1, 2\); it must be \(1, 3\)"),
         ({"path_loss_db": []}, r"path_loss_db: shape \(0,\)"),
         ({"path_loss_db": 80.0}, r"path_loss_db: shape \(\)"),
         ({"path_loss_db": [np.inf]}, "path loss is infinite"),

@@ -196,5 +196,5 @@ def test_impossible_settings_are_refused(settings, message):
 
 
 def test_memory_before_the_first_evaluation_is_refused():
-    with pytest.raises(InputError, match="no memory before its first evaluation"):
+    with pytest.raises(InputError, match="no memory before the first evaluation"):
         _ = SGWOIM(LOWER, UPPER).memory

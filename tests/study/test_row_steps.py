@@ -208,7 +208,7 @@ def test_averages_stay_within_transmitter_and_group(folder):
     ("links", "message"),
     [
         ({"transmitter": "phone"}, "no column 'phone'"),
-        ({"noise_floor_dbm": -10.0}, "all 16 rows"),
+        ({"noise_floor_dbm": -10.0}, "no row remains"),
         ({"quantity": "path_loss", "noise_floor_dbm": -100.0}, "is a received power"),
         ({"average": {"by": "time", "size": 3.0}}, "needs time"),
         ({"quantity": "received_power"}, "set quantity = 'rsrp' and add an \\[offset\\]"),

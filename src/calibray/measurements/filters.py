@@ -31,7 +31,7 @@ MAX_PARTS: Final = 2_000
 """Maximum number of names, values and operators in a filter."""
 
 MAX_DEPTH: Final = 50
-"""Largest nesting depth of a filter."""
+"""Maximum nesting depth of a filter."""
 
 MAX_PATTERN_LENGTH: Final = 200
 """Maximum number of characters in a regular expression."""
@@ -144,7 +144,7 @@ def _affix(pat: Any, na: Any) -> Any:
 
 # In practice, a search for a pattern with several repetitions or a repeated group may never end. The allowed patterns
 # are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is possessive, so
-# checking a pattern is cheap as well.
+# checking a pattern is also cheap.
 _CLASS: Final = r"\[\^?(?:\\.|[^\[\]\\])+\]"
 _CHARACTER: Final = rf"(?:\\[^0-9A-Za-z]|\\[bBdDsSwW]|{_CLASS}|[^\\^$*+?{{}}\[\]()|])"
 _ALTERNATIVE: Final = rf"\^?{_CHARACTER}*+[*+?]?{_CHARACTER}*+\$?"
@@ -193,7 +193,7 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
         [False, False, True]
     """
     if len(expression) > MAX_LENGTH:
-        raise InputError(f"{len(expression)} characters, must be at most {MAX_LENGTH}; shorten it")
+        raise InputError(f"{len(expression)} characters, but at most {MAX_LENGTH} are allowed; shorten it")
     code, backticked = _as_python(expression.strip())
     # Python warns about escapes in strings, and pandas about groups in patterns; neither warning helps the author of a
     # filter.
@@ -232,7 +232,7 @@ def _as_python(expression: str) -> tuple[str, dict[str, str]]:
 
 
 def _parse(code: str, columns: Iterable[object]) -> ast.expr:
-    """Parse an expression into a syntax tree. Malformed and excessively large expressions are refused."""
+    """Parse an expression into a syntax tree. Malformed and excessively large expressions are rejected."""
     try:
         tree = ast.parse(code, mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:

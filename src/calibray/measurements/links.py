@@ -24,7 +24,7 @@ FEW: Final = 8
 """Smallest number of links from which a trend, a noise model or a prediction error is estimated."""
 
 MAX_CARRIERS: Final = 32
-"""Largest number of carrier frequencies. A column with more distinct values probably contains a different quantity."""
+"""Maximum number of carrier frequencies. A column with more distinct values probably contains a different quantity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,7 +87,7 @@ class Measurements:
             if getattr(self, name) is not None:
                 array = _as_array(name, getattr(self, name), dtype)
                 if array.shape != shape:
-                    raise InputError(f"{name}: shape {array.shape}, must be {shape}")
+                    raise InputError(f"{name}: shape {array.shape}; it must be {shape}")
                 array.flags.writeable = False
                 object.__setattr__(self, name, array)
         if self.table is None:

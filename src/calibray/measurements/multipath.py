@@ -134,8 +134,8 @@ def read_multipath(
     seconds = table.numbers(delay) * SECONDS[unit]
     if seconds.max() > LONGEST:
         raise InputError(
-            f"{path}: column {delay!r} has a delay of {seconds.max():g} s, must be at most {LONGEST:g} s; state the "
-            "unit in the column name, such as delay_ns"
+            f"{path}: column {delay!r} has a delay of {seconds.max():g} s, but at most {LONGEST:g} s is allowed; "
+            "state the unit in the column name, such as delay_ns"
         )
     level_db, is_loss = table.numbers(power), re.search(r"loss|(^|_)pl(_|$)", names[power]) is not None
     median, is_level = float(np.median(level_db)), matches(power, "decibel") and "gain" not in power.lower()
