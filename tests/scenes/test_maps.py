@@ -206,12 +206,18 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     ("change", "message"),
     [
         ({"height": "height"}, "no column 'height'"),
-        ({"height": "word"}, "polygon 1: word = 'high', must be a length in metres; correct it, or leave"),
+        (
+            {"height": "word"},
+            "polygon 1: word = 'high', but must be a length in metres; correct it, or leave",
+        ),
         (
             {"height": None, "columns": FootprintColumns(levels="storeys")},
-            "polygon 2: storeys = '4;5', must be a number of storeys; correct it, or leave it empty",
+            "polygon 2: storeys = '4;5', but must be a number of storeys; correct it, or leave it empty",
         ),
-        ({"height": "negative"}, "polygon 2: negative = -1, must be finite, not negative and at most 1000"),
+        (
+            {"height": "negative"},
+            "polygon 2: negative = -1, but must be finite, not negative and at most 1000",
+        ),
         ({"layer": "roads"}, r"^\S+t\.gpkg: no layer 'roads'; use one of: t$"),
     ],
 )
@@ -308,18 +314,18 @@ def test_missing_heights_are_filled_and_counted(tmp_path):
     frame = Frame.utm(11.5755, 48.1374)
     terrain = read_terrain(height_model(tmp_path / "dem.tif", missing=True), frame, (-100, -100, 100, 100))
     assert np.isfinite(terrain.z).all()
-    assert terrain.repairs == {"heights missing, taken from the nearest": 12}
+    assert terrain.repairs == {"missing heights, filled from the nearest cell": 12}
     buildings, _ = read_footprints(layer(tmp_path / "t.gpkg", [5.0, 5.0, 5.0], "GPKG"), "hoehe", frame=frame)
     wide = read_terrain(height_model(tmp_path / "dem.tif", missing=True), frame, (-100, -100, 200, 100))
     made = make_scene(buildings, tmp_path / "scene", frame, wide)
-    assert made.counts["heights missing, taken from the nearest"] == 12
+    assert made.counts["missing heights, filled from the nearest cell"] == 12
 
 
 @pytest.mark.parametrize(
     ("bounds", "spacing", "message"),
     [
         ((0, 0, 1000, 10), None, "does not cover"),
-        ((-100, -100, 100, 100), 0.01, "give a wider spacing"),
+        ((-100, -100, 100, 100), 0.01, "give a larger spacing"),
         ((-100, -100, 100, 100), -1.0, "greater than 0"),
     ],
 )
@@ -489,9 +495,7 @@ def test_an_undeclared_gap_is_no_height(tmp_path, gap):
     heights[heights == -9999.0] = gap
     with rasterio.open(file, "w", **{**profile, "nodata": None}) as model:
         model.write(heights, 1)
-    with pytest.raises(
-        InputError, match=r"12 of .* cells have values .* not heights on land, such as .*a_nodata"
-    ):
+    with pytest.raises(InputError, match=r"12 of .* values are .* not heights on land, such as .*a_nodata"):
         read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
 
 
@@ -505,7 +509,7 @@ def test_cells_far_below_all_cells_around_them_cause_a_warning(tmp_path, caplog)
         model.write(feet, 1)
         model.units = ("ft",)
     read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
-    assert "12 of 576 cells have the height -304.5 m" in caplog.text
+    assert "the height in 12 of 576 cells is -304.5 m" in caplog.text
     # Row 30 and column 40: 95 m to the north and 5 m to the east of the frame's origin, in UTM.
     assert "longitude 11.57561, latitude 48.13825" in caplog.text
     assert "-a_nodata -999)" in caplog.text
@@ -515,7 +519,7 @@ def test_cells_far_below_all_cells_around_them_cause_a_warning(tmp_path, caplog)
 
 
 @pytest.mark.parametrize(
-    ("tiled", "reach", "message"), [(True, 400, "more than 25,000,000"), (False, 4, "is stored in blocks of")]
+    ("tiled", "reach", "message"), [(True, 400, "at most 25,000,000"), (False, 4, "is stored in blocks of")]
 )
 def test_a_height_model_of_enormous_size_is_refused_before_it_is_read(tmp_path, tiled, reach, message):
     """A file of some kilobytes that declares 10^10 heights."""

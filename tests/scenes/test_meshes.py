@@ -110,17 +110,29 @@ def test_further_columns_are_ignored(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("corners", "faces", "message"),
     [
-        (CORNERS, [[0, 1, 2], [0, 2, 4]], r"face 1 refers to vertex 4, must be 0 to 3"),
-        (CORNERS, [[0, 1, 99_999_999], [0, 2, 3]], r"face 0 refers to vertex 1e\+08, must be 0 to 3"),
+        (
+            CORNERS,
+            [[0, 1, 2], [0, 2, 4]],
+            r"face 1 refers to vertex 4, but must refer to vertices from 0 to 3",
+        ),
+        (
+            CORNERS,
+            [[0, 1, 99_999_999], [0, 2, 3]],
+            r"face 0 refers to vertex 1e\+08, but must refer to vertices from 0 to 3",
+        ),
         (
             CORNERS,
             [[0, 1, 2], [0, -1, 3]],
-            r"face 1 (refers to vertex -1, must be 0|is '3 0 -1 3', must be 3)",
+            r"face 1 (refers to vertex -1, but must refer|is '3 0 -1 3', but must be the number 3)",
         ),
-        (CORNERS, [[0, 1, 2, 3]], "face 0 (has 4 corners, must have|is '4 0 1 2 3', must be) 3"),
-        (CORNERS, [[0, 1, 2], [0, 2]], r"unexpected length|face 1 is '2 0 2', must be 3"),
-        (np.where(CORNERS == 9, np.nan, CORNERS), FACES, r"x of vertex 1 is nan, must be finite"),
-        (np.where(CORNERS == 9, np.inf, CORNERS), FACES, r"x of vertex 1 is inf, must be finite"),
+        (
+            CORNERS,
+            [[0, 1, 2, 3]],
+            "face 0 (has 4 corners, but must have|is '4 0 1 2 3', but must be the number) 3",
+        ),
+        (CORNERS, [[0, 1, 2], [0, 2]], r"unexpected length|face 1 is '2 0 2', but must be the number 3"),
+        (np.where(CORNERS == 9, np.nan, CORNERS), FACES, r"x of vertex 1 is nan, but must be finite"),
+        (np.where(CORNERS == 9, np.inf, CORNERS), FACES, r"x of vertex 1 is inf, but must be finite"),
         (CORNERS, [], "has no vertices or no faces"),
         (CORNERS[:0], [], "has no vertices or no faces"),
     ],

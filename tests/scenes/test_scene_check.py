@@ -59,7 +59,7 @@ def test_faces_that_share_no_vertices_are_found(tmp_path):
     loose = Mesh(sound.vertices[sound.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3))
     result = check(tmp_path, loose)
     assert problems(result) == [
-        "18 edges at which faces meet without sharing vertices: no diffraction there"
+        "18 edges at which faces meet without sharing vertices, where Sionna RT finds no diffraction"
     ]  # fmt: skip
     assert result.objects[0].open_edges == 0
 

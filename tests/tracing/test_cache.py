@@ -52,7 +52,7 @@ def test_a_damaged_entry_is_dropped_with_a_line(
         assert cache.load_trace("d") is None
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "d.h5: is damaged" in caplog.text
-    assert "tracing again" in caplog.text
+    assert "traced again" in caplog.text
     assert not entry.exists()
 
 

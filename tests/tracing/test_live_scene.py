@@ -357,7 +357,7 @@ def test_what_a_study_cannot_state_is_refused(measured: np.ndarray, tmp_path: Pa
         with pytest.raises(InputError, match=message):
             cb.Study.from_sionna(scene, values, tmp_path)
 
-    refused("street", "must be a scene of sionna.rt")
+    refused("street", "must be a sionna.rt scene")
     refused(street(), r"shape \(8, 2\), must be \(2, 8\)", measured.T)
     refused(street(), "column 'r' is not a receiver", pd.DataFrame(measured[:, :1], ["tx0", "tx1"], ["r"]))
     scene = street()

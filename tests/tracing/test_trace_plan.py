@@ -127,7 +127,7 @@ def test_long_traces_are_announced():
     long = plan_trace(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
     assert long.announcement(11) == (
         "Tracing 11 links in 11 launches of up to 20,000,000 rays x interactions x receivers; "
-        "about 0.9 GiB of memory, plus that of the scene and the paths, "
+        "this takes about 0.9 GiB, plus the memory of the scene and the paths, "
         "and 7 seconds on two cores"
     )
     # Ten thousand times the rays take ten thousand times as long.
@@ -139,6 +139,6 @@ def test_rays_added_in_rounds_take_one_launch_per_position():
     plan = plan_trace(MASTS, TraceSettings(samples="auto", max_depth=5), 20_000_000, 1_000_000)
     assert sorted(len(launch.links) for launch in plan.launches) == [4, 7]
     assert plan.announcement(11) == (
-        "Tracing 11 links from 2 positions, adding rays until path loss converges; about 6 seconds on two cores, "
-        "longer while rays still find paths"
+        "Tracing 11 links from 2 positions, adding rays until path loss converges; this takes about 6 seconds on two "
+        "cores, or longer if new paths are still found"
     )

@@ -124,7 +124,7 @@ def test_more_paths_than_memory_can_hold_are_an_error(
 ) -> None:
     monkeypatch.setattr("calibray.tracing.sionna.tracer.available_memory", lambda: 32_000)
     for count in (4, 3):  # of three receivers, the last is repeated
-        message = rf"more paths than fit into memory, with {count} receivers at once; lower trace\.samples"
+        message = rf"more paths than fit into memory, with {count} receivers at once; reduce trace\.samples"
         with pytest.raises(EngineError, match=message):
             canyon.trace(links(MAST, receivers[:count]))
 
@@ -342,7 +342,7 @@ def test_invalid_positions_are_refused(house: Tracer, tx: list, rx: list, messag
         ({"tx_antenna": {"pattern": "yagi"}}, r"antenna pattern = 'yagi': must be one of iso, dipole"),
         ({"rx_antenna": {"polarization": "R"}}, r"antenna polarization = 'R': must be one of V, H"),
         ({"rx_antenna": {"gain": 3}}, r"rx_antenna: unknown key 'gain'; known: pattern"),
-        ({"tx_antenna": "dipole"}, r"tx_antenna: is 'dipole', must be an Antenna or its attributes"),
+        ({"tx_antenna": "dipole"}, r"tx_antenna: is 'dipole', but must be an Antenna or its attributes"),
         ({"rx_antenna": {"orientation": [0, 1]}}, r"antenna orientation = .*must be three angles"),
         ({"rx_antenna": {"orientation": ["a", 0, 0]}}, r"antenna orientation = .*must be three angles"),
         (

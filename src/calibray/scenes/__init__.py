@@ -1,7 +1,8 @@
 """Scenes: the geometry and materials that a ray tracer reads.
 
-This package reads and writes scenes; `scenes.checks` finds faults in scenes and positions, and `scenes.authoring` makes
-scenes from maps and floor plans. Both subpackages import from this package, but not from each other.
+This package reads and writes scenes. Its subpackage `scenes.checks` finds faults in scenes and positions, and
+`scenes.authoring` makes scenes from maps and floor plans. Both subpackages import from this package, but not from each
+other.
 """
 
 from calibray.scenes.buildings import building_numbers as building_numbers

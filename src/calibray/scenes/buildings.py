@@ -1,6 +1,6 @@
 """Assignment of positions to buildings: objects that touch in plan form one building.
 
-The edges of all triangles except those of the ground are rasterized in plan. Cells that touch, even at corners only,
+The edges of all triangles except those of the ground are rasterized in plan. Cells that touch, even if only at corners,
 form one building. Streets therefore separate buildings, but a row of houses, or a wall with its windows, is one
 building.
 """
@@ -21,10 +21,10 @@ CELL: Final = 1.0
 depending on their position."""
 
 MAX_CELLS: Final = 8_000_000
-"""Largest number of raster cells, to limit memory use; larger scenes have wider cells."""
+"""Maximum number of raster cells, to limit memory use; larger scenes have wider cells."""
 
 MAX_POINTS: Final = 2_000_000
-"""Largest number of points along edges in memory at once."""
+"""Maximum number of points along edges in memory at once."""
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:

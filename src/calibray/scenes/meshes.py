@@ -4,7 +4,7 @@ Sionna RT finds wedges only between faces that share vertices within one mesh. W
 and therefore no diffraction.
 
 Mitsuba does not validate mesh files. If a vertex index is out of range, the process crashes or a reflection is missing
-without a message; rays never hit faces with NaN vertices. `read_mesh` refuses such files. Integer coordinates are
+without a message. Rays never hit faces with NaN vertices. `read_mesh` refuses such files. Integer coordinates are
 valid, but cause Mitsuba to lose all reflections from the mesh, so the tracer reads a floating-point copy.
 """
 
@@ -29,14 +29,14 @@ MILLIMETRE: Final = 0.001
 """Unit of integer corner coordinates [m]."""
 
 WIDEST: Final = 50_000.0
-"""Largest extent of a new scene [m]; a wider scene is probably not in metres, or not near a local origin."""
+"""Maximum extent of a new scene [m]; a wider scene is probably not in metres, or not near a local origin."""
 
 LARGEST_COORDINATE: Final = 1e9
-"""Largest coordinate of a vertex or an antenna [m]; the same limit applies to positions in path files."""
+"""Maximum coordinate of a vertex or an antenna [m]; the same limit applies to positions in path files."""
 
 SMALL: Final = 4096
-"""Largest PLY file whose mesh is cached within a process [bytes], such as that of one building. A run reads its scene
-up to five times. Reading a scene of 2,367 buildings takes 2.8 s the first time and 0.8 s after that."""
+"""Maximum size of a PLY file whose mesh is cached within a process [bytes], such as the file of one building. A run
+reads its scene up to five times. Reading a scene of 2,367 buildings takes 2.8 s the first time and 0.8 s after that."""
 
 _HEADER: Final = re.compile(
     rb"ply\r?\n(?:(?:comment|obj_info)\b.*\n)*"
@@ -96,7 +96,7 @@ def weld(
 ) -> Mesh:
     """Make a mesh from triangles with integer corners [F, 3, 3]; equal corners become one vertex.
 
-    Triangles are counter-clockwise when seen from outside; those with two equal corners are dropped. Corners are in
+    Triangles are counter-clockwise when seen from outside; triangles with two equal corners are dropped. Corners are in
     units of `MILLIMETRE`, unless `position` converts corners [n, 3] to positions [n, 3], [m].
 
     Example:
@@ -117,8 +117,8 @@ def read_mesh(file: Path, kind: str) -> Mesh:
     Polygons of an OBJ file are split into triangles.
 
     Raises:
-        InputError: The file cannot be read, is damaged or has no face; a vertex is not finite; a face refers to a
-            vertex that does not exist; or, in a PLY file, a face is not a triangle.
+        InputError: The file cannot be read, is damaged or has no face, or a vertex is not finite. A face refers to a
+            vertex that does not exist or, in a PLY file, is not a triangle.
     """
     try:
         content = file.read_bytes()
@@ -171,7 +171,7 @@ def _read_ply(content: bytes) -> Mesh:
         # trimesh assumes that all faces have as many corners as the first one.
         counts, corners = face["data"][name]["f0"], face["data"][name]["f1"]
         if (other := np.flatnonzero(counts != 3)).size:
-            raise InputError(f"face {other[0]} has {counts[other[0]]} corners, must have 3")
+            raise InputError(f"face {other[0]} has {counts[other[0]]} corners, but must have 3")
     vertices = np.stack(
         [np.asarray(vertex["data"][axis], dtype=np.float64).ravel() for axis in "xyz"], axis=1
     )
@@ -181,7 +181,8 @@ def _read_ply(content: bytes) -> Mesh:
     if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners != np.floor(corners))).any():
         row, corner = np.argwhere(wrong)[0]
         raise InputError(
-            f"face {row} refers to vertex {corners[row, corner]:g}, must be 0 to {len(vertices) - 1}"
+            f"face {row} refers to vertex {corners[row, corner]:g}, but must refer to vertices from 0 to "
+            f"{len(vertices) - 1}"
         )
     misread = any(kind.kind != "f" for kind in stored)
     # Only in single precision is the spacing large enough to matter.
@@ -195,7 +196,7 @@ def _check_range(vertices: NDArray[np.float64]) -> None:
     if (wrong := ~(np.abs(vertices) <= LARGEST_COORDINATE)).any():
         row, axis = np.argwhere(wrong)[0]
         raise InputError(
-            f"{'xyz'[axis]} of vertex {row} is {vertices[row, axis]:g}, must be finite and at most "
+            f"{'xyz'[axis]} of vertex {row} is {vertices[row, axis]:g}, but must be finite and at most "
             f"{LARGEST_COORDINATE:g} m"
         )
 
@@ -206,11 +207,13 @@ def _check_text_faces(text: str, elements: dict[str, dict[str, Any]]) -> None:
     first = sum(lengths[name] for name in takewhile(lambda name: name != "face", lengths))
     for index, line in enumerate(text.splitlines()[first : first + lengths["face"]]):
         if not _TEXT_FACE.fullmatch(line):
-            raise InputError(f"face {index} is {shortened(line)!r}, must be 3 and three vertex indices")
+            raise InputError(
+                f"face {index} is {shortened(line)!r}, but must be the number 3 and three vertex indices"
+            )
 
 
 def _read_obj(content: bytes) -> Mesh:
-    """Read vertices and faces; as in Mitsuba, corners that differ in texture or normal are different vertices."""
+    """Read vertices and faces; as in Mitsuba, corners with different textures or normals are different vertices."""
     # trimesh is not used here: it drops faces that it cannot read, interprets index 0 as the first vertex, and misreads
     # faces whose corners are written in different forms (1/1/1 and 1).
     positions: list[list[float]] = []

@@ -1,4 +1,4 @@
-"""Obstruction of links by buildings and regions of extra loss, and link columns computed from scene and positions.
+"""Obstruction of links by buildings and regions of extra loss, and link columns computed from the scene.
 
 The straight line between the ends of a link can pass through buildings, over roofs and through walls. Buildings extend
 from the ground to their roofs, so a line is inside a building where a roof is above the line. All lengths are computed
@@ -23,11 +23,11 @@ from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, v
 from calibray.support.lazy_imports import library
 
 STEP: Final = 5.0
-"""Spacing of the points at which a line's height above ground is computed [m]. With this spacing, lengths in a wood on
-50 m hills have errors of 0.1 m."""
+"""Spacing of the points at which a line's height above ground is computed [m]. With this spacing, lengths of paths
+through a wood on hills 50 m high have errors of 0.1 m."""
 
 LINES: Final = 5000
-"""Largest number of lines processed at once; each can have hundreds of steps."""
+"""Maximum number of lines processed at once; each line can have hundreds of steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Region:
         bottom: Height of the bottom of each prism [n], [m].
         top: Height of the top of each prism [n], [m].
         ground: Function that returns the height of the ground [k], [m], at x and y [k], [m], or NaN where there is no
-            ground. The heights of the prisms are measured from this ground or, if None, from z = 0.
+            ground. The heights of the prisms are measured from this ground or, if `ground` is None, from z = 0.
     """
 
     outline: NDArray[Any]
@@ -97,7 +97,7 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) with heights above ground inside the prism, found in steps."""
+        """The parts of spans (line, lower, upper, prism) inside the prism over uneven ground, computed step by step."""
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]
@@ -118,13 +118,13 @@ class Region:
 def united(
     spans: NDArray[np.float64],
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """The union of spans (line, lower, upper, ...), which can overlap: line, lower and upper end of each piece."""
+    """Merge overlapping spans (line, lower, upper, ...), and yield the line, lower end and upper end of all pieces."""
     count = len(spans)
     if not count:
         return
     event = np.concatenate([spans[:, [0, 1]], spans[:, [0, 2]]])
     change = np.repeat([1, -1], count)
-    # Where one span ends and the next begins, the beginning is sorted first, so that the two form one piece.
+    # Where one span ends and another begins, the beginning is sorted first, so that the two spans form one piece.
     order = np.lexsort((-change, event[:, 1], event[:, 0]))
     depth = np.cumsum(change[order])
     begins = (depth == 1) & (change[order] == 1)
@@ -139,7 +139,7 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of each line between two heights, as two fractions of the line [k]; empty if the first is larger."""
+    """The part of each line between two heights, as two fractions [k]; it is empty if the first is larger."""
     rise = last - first
     # A level line is between the heights along its whole length or nowhere.
     level = np.abs(rise) < 1e-9
@@ -155,8 +155,9 @@ OUT_OF_SIGHT: Final = "out_of_sight"
 WALLS: Final = "walls_crossed"
 
 OBSTACLES: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
-"""Link columns computed from a scene: whether the straight line between the ends is blocked, how many walls it crosses,
-its length inside buildings [m], and the knife-edge diffraction loss of the dominant roof edge [dB]."""
+"""Link columns computed from a scene: whether the straight line between the ends is blocked, the number of walls that
+the line crosses, its length inside buildings [m], and the knife-edge diffraction loss of the dominant roof edge
+[dB]."""
 
 SAME_CROSSING: Final = 1e-3
 """Distance below which two crossings count as one, for example on an edge that two triangles share [m]."""
@@ -204,7 +205,7 @@ class Obstruction:
 
 
 def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]) -> Obstruction:
-    """Compute the obstruction of links with ends [n, 3], [m]; ground triangles block only as floors between the ends.
+    """Compute the obstruction of links with ends [n, 3], [m]; ground blocks a link only as a floor between its ends.
 
     Example:
         A roof 10 m high over the square from (0, 0) to (10, 10) m, and one wall at x = 0:
@@ -285,11 +286,11 @@ def _pairs(
         lines = np.flatnonzero(of.reshape(-1) == number)
         lines = lines[np.argsort(azimuth[lines], kind="stable")]
         sorted_azimuth = azimuth[lines]
-        # Repeated one turn later, so that a range of azimuths across 180 degrees is contiguous.
+        # The azimuths are repeated one turn later, so that a range of azimuths across 180 degrees is contiguous.
         twice = np.concatenate([sorted_azimuth, sorted_azimuth + 2 * np.pi])
         relative = corners[:, :, :2] - origin
         direction = np.arctan2(relative[..., 1], relative[..., 0])
-        # Azimuths relative to the first corner, in (-pi, pi], so that a range across 180 degrees stays contiguous.
+        # Azimuths are relative to the first corner, in (-pi, pi], so that a range across 180 degrees stays contiguous.
         turn = np.angle(np.exp(1j * (direction - direction[:, :1])))
         low, high = direction[:, 0] + turn.min(axis=1), direction[:, 0] + turn.max(axis=1)
         around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on its side
@@ -342,7 +343,7 @@ def _under(
         offset = point[..., :2] - corners[:, 0, :2]
         roof = corners[:, 0, 2] - (normal[:, :2] * offset).sum(axis=-1) / normal[:, 2]
         above = np.where(over, roof - point[..., 2], -1.0)
-        # Fraction at which the line passes through the plane; used only where the signs at the two ends differ.
+        # Fraction at which the line passes through the plane; it is used only where the signs at the two ends differ.
         zero = low + (high - low) * above[0] / (above[0] - above[1])
         lower = np.where(above[0] > 0, low, zero)
         upper = np.where(above[1] > 0, high, zero)
@@ -409,7 +410,7 @@ def with_obstruction(
     Args:
         links: The links.
         scene: The scene.
-        frequency: Carrier frequency [Hz], used if the links do not state their own.
+        frequency: Carrier frequency [Hz], used if the links do not state a frequency.
         regions: The regions of extra loss by name; `REGION` is added only if there are regions.
         clutter: Whether to add `CLUTTER`.
         cluster_m: Side length of the grid squares for `CLUSTER` [m], one of which has a corner at the origin; None to
@@ -439,7 +440,7 @@ def cluster_labels(position: NDArray[np.float64], side: float) -> NDArray[np.str
 
 
 SHORTEST: Final = 250.0
-"""Shortest path length for which ITU-R P.2108 specifies the clutter loss at one end [m]."""
+"""Minimum path length for which ITU-R P.2108 specifies the clutter loss at one end [m]."""
 
 CARRIERS: Final = (0.5e9, 67e9)
 """Range of carrier frequencies that ITU-R P.2108 covers [Hz]."""

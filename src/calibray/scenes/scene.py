@@ -2,8 +2,8 @@
 
 In the scene for the tracer, each surface material is a plain Sionna `radio-material` with explicit constants and a name
 that Calibray chooses. This keeps the constants in one place (`Material`) and allows frequencies outside the range of an
-ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72). It also avoids Sionna's naming rules: an ITU name
-needs the prefix `itu_`, and an object must not have the name of a material.
+ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72). The new names also avoid conflicts with Sionna's
+naming rules: an ITU name needs the prefix `itu_`, and an object must not have the name of a material.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ TRACED: Final = "mat-calibray-"
 """Prefix of material ids in the scene for the tracer, followed by the index in `Scene.materials`."""
 
 ITU_NAMES: Final = frozenset(name for table in ITU_MATERIALS.values() for name in table)
-"""Names of the materials in all revisions of ITU-R P.2040; Sionna RT reserves them."""
+"""Names of the materials in all revisions of ITU-R P.2040, which Sionna RT reserves."""
 
 _MATERIAL_FIELDS: Final = frozenset(entry.name for entry in fields(Material))
 _BULK_FIELDS: Final = frozenset({"relative_permittivity", "conductivity"})
@@ -80,7 +80,7 @@ class Scene:
         materials: The materials that objects use, by name, with their constants at `frequency`.
         objects: The meshes, in file order.
         xml: XML of the scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
-        laws: Frequency law of each material: that of ITU-R P.2040 for ITU materials, otherwise constant.
+        laws: Frequency law of each material: the law of ITU-R P.2040 for ITU materials, otherwise constant.
         sizes: Bounds and size of each object.
         frequency: The frequency for which the scene was read [Hz]; None if the constants are valid at all frequencies.
     """
@@ -96,7 +96,7 @@ class Scene:
 
     @property
     def local_origin(self) -> NDArray[np.float64]:
-        """Origin of the frame in which the scene is traced [3], [m]; zero unless the scene is far from (0, 0, 0)."""
+        """Origin of the frame in which the scene is traced [3], [m]; zero if the scene is near (0, 0, 0)."""
         return local_origin(self.sizes)
 
     def check_frequency(self, frequency: float) -> None:
@@ -131,9 +131,9 @@ def read_scene(
             material, with `*` replaced by the object's name.
 
     Raises:
-        InputError: The file does not exist or is not a Mitsuba scene; a mesh is missing or malformed; a material has no
-            radio constants; an override is for a material that is not in the scene; a pattern matches no object, or
-            objects with different materials; or the frequency is outside the range of an ITU law.
+        InputError: The file does not exist or is not a Mitsuba scene, or a mesh is missing or malformed. A material has
+            no radio constants, or an override is for a material that is not in the scene. A pattern matches no object,
+            or objects with different materials. The frequency is outside the range of an ITU law.
     """
     overrides, split = dict(overrides or {}), dict(split or {})
     path = scene_path(str(source))
@@ -269,7 +269,7 @@ def _split_name(
     name = name[:-1] + object_name if name.endswith("*") else name
     if name in definitions:
         raise InputError(
-            f"[objects] {name}: the scene already has a material of that name; choose another name"
+            f"[objects] {name}: the scene already has a material with this name; choose another name"
         )
     return name
 
@@ -431,7 +431,7 @@ def export_scene(
 def exported_names(names: Iterable[str]) -> dict[str, str]:
     """Choose unique material names of letters, digits, `_` and `-` for an exported scene.
 
-    Sionna RT refuses a plain `radio-material` with an ITU name, so such a name becomes `calibrated-NAME`. Mitsuba
+    Sionna RT refuses a plain `radio-material` with an ITU name, so an ITU name becomes `calibrated-NAME`. Mitsuba
     misreads names with dots, quotes or line breaks.
 
     Example:

@@ -31,7 +31,7 @@ MESHES: Final = "meshes"
 """Folder for meshes, next to the scene file."""
 
 MAX_DEPTH: Final = 64
-"""Largest nesting depth of elements in a scene file."""
+"""Maximum nesting depth of elements in a scene file."""
 
 _NOT_RADIO: Final = frozenset(
     (
@@ -107,7 +107,7 @@ def scene_path(source: str) -> Path:
                 entry.name for entry in folder.iterdir() if (entry / f"{entry.name}.xml").is_file()
             )
             raise InputError(
-                f"scene {shortened(source, 300)!r}: Sionna RT bundles no such scene; it has {', '.join(bundled)}"
+                f"scene {shortened(source, 300)!r}: is not bundled with Sionna RT; choose one of {', '.join(bundled)}"
             )
         return path
     path = Path(source)
@@ -196,7 +196,7 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     kind, name = shape.get("type", ""), shape.get("id")
     if kind not in SHAPES:
         raise InputError(
-            f"{path}: shape {name!r} is a {shortened(kind)!r}, must be one of {', '.join(SHAPES)}; "
+            f"{path}: shape {name!r} is a {shortened(kind)!r}, but must be one of {', '.join(SHAPES)}; "
             "export it as a PLY mesh of triangles"
         )
     _check_transform(shape, path)
@@ -229,16 +229,16 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
                 flat = np.linalg.det(numbers.reshape(int(np.sqrt(len(numbers))), -1)) == 0
         if flat or not np.isfinite(numbers).all():
             raise InputError(
-                f"{path}: <{step.tag}> of shape {shape.get('id')!r} is {shortened(' '.join(words))!r}, must be finite "
-                "numbers that do not flatten the shape; export the scene again"
+                f"{path}: <{step.tag}> of shape {shape.get('id')!r} is {shortened(' '.join(words))!r}, but must be "
+                "finite numbers that do not flatten the shape; export the scene again"
             )
 
 
 def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
-    """Reduce a scene to the elements that a trace needs, so Mitsuba reads no others.
+    """Reduce a scene to the elements that a trace needs, so that Mitsuba reads no other elements.
 
-    Mitsuba would also load textures, emitters and sensors. These have no effect on radio waves, but can crash the
-    process if they are malformed.
+    Mitsuba would also load textures, emitters and sensors. These elements have no effect on radio waves, but can crash
+    the process if they are malformed.
 
     Raises:
         InputError: The scene includes another file, or contains an element, a property or a parameter that Calibray
@@ -264,7 +264,7 @@ def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
                 if "$" in value:
                     raise InputError(
                         f"{path}: {key} = {shortened(repr(value))} in {owner} is a parameter of the scene, which "
-                        "Calibray does not substitute; write its value"
+                        "Calibray does not substitute; write its value instead"
                     )
 
 
@@ -291,14 +291,15 @@ def write_scene(
 ) -> Path:
     """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object.
 
-    A material whose `type` is an ITU-R P.2040 material has the permittivity and conductivity of that type. The frame is
-    stored in a comment, which `read_frame` reads. With `overwrite`, files that Calibray did not write are replaced.
+    A material whose `type` is an ITU-R P.2040 material has the permittivity and conductivity of that ITU material. The
+    frame is stored in a comment, which `read_frame` reads. With `overwrite`, files that Calibray did not write are
+    replaced.
 
     Returns the path of the XML file.
 
     Raises:
-        InputError: The folder cannot be written to, or a file in it must not be replaced. In these cases, no file is
-            written.
+        InputError: The folder cannot be written to, or a file in it must not be replaced. In case of an error, no
+            file is written.
     """
     meshes = {f"{item.name}.ply": item.mesh for item in objects}
     check_outputs(folder, ["scene.xml"], overwrite=overwrite)

@@ -1,8 +1,8 @@
 """Shapes of a scene in the scene frame: double-precision transforms, sizes, and copies for the tracer.
 
 A ray tracer computes in single precision, whose spacing is about 0.1 mm at 1 km from the origin and 0.5 m at UTM
-northings. A scene far from the origin is therefore traced in a local frame. This module reads and moves its meshes in
-double precision, and only then rounds them.
+northings. A scene far from the origin is therefore traced in a local frame. This module reads and moves the meshes of
+such a scene in double precision, and only then rounds their coordinates.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
     """Read the surface of a shape in the scene frame.
 
     Raises:
-        InputError: As for `place_mesh`, or the spacing of the stored coordinates exceeds `TOO_COARSE`.
+        InputError: The shape cannot be read (see `place_mesh`), or the spacing of the stored coordinates exceeds
+            `TOO_COARSE`.
     """
     mesh = place_mesh(shape, path)
     if mesh.step > TOO_COARSE:
@@ -101,7 +102,8 @@ def place_mesh(shape: ElementTree.Element, path: Path) -> Mesh:
     """Read the mesh of a shape, or make the mesh of a rectangle or cube, and apply the shape's transform.
 
     Raises:
-        InputError: As for `shape_mesh`, or the transform contains an element that Calibray does not support.
+        InputError: The mesh cannot be read (see `shape_mesh`), or the transform contains an element that Calibray does
+            not support.
     """
     mesh = shape_mesh(shape, path)
     if mesh is None:
@@ -194,8 +196,8 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame in which a scene is traced.
 
     For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. A
-    scene is far if its largest coordinate exceeds both `FAR` and the scene's extent. The local frame then gains at
-    least one bit of precision. Otherwise the local origin is zero.
+    scene counts as far from the origin if its largest coordinate exceeds both `FAR` and the scene's extent. The local
+    frame then gains at least one bit of precision. Otherwise the local origin is zero.
     """
     if not sizes:
         return np.zeros(3)

@@ -27,7 +27,7 @@ WITHOUT_GAPS: Final = 0.9
 """A level object that covers more than this fraction of its bounding box [1] is a sheet, such as a floor."""
 
 BATCH: Final = 2_000_000
-"""Largest number of line-triangle pairs in memory at once; each pair needs about 100 bytes."""
+"""Maximum number of line-triangle pairs in memory at once; each pair needs about 100 bytes."""
 
 _EDGE: Final = 1e-9
 """Distance in plan up to which points outside a triangle count as inside, relative to the triangle's size [1]."""
@@ -226,6 +226,6 @@ def vertical_crossings(
 def _grid_index(
     axis: NDArray[np.float64], value: NDArray[np.float64], side: Literal["left", "right"]
 ) -> NDArray[np.int64]:
-    """Index of values on a grid axis, with a tolerance for points on the edges of triangles."""
+    """Indices of values on a grid axis, with a tolerance for points on the edges of triangles."""
     tolerance = _EDGE * max(float(np.ptp(axis)), 1.0) * (1 if side == "right" else -1)
     return np.searchsorted(axis, value + tolerance, side=side)

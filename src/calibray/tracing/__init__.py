@@ -15,7 +15,7 @@ from calibray.tracing.settings import Antenna, TraceSettings
 
 @final
 class SionnaFactory:
-    """Opens scenes in Sionna RT; a `TracerFactory`."""
+    """A `TracerFactory` that opens scenes in Sionna RT."""
 
     @property
     def versions(self) -> dict[str, str]:

@@ -75,11 +75,12 @@ class AntennaPattern:
     ) -> Any:
         """Amplitude of the field in a direction, with electrical downtilt and horizontal steering [rad].
 
-        For an array, both steer the beam through the phases of the elements. For a single antenna, the downtilt shifts
-        the pattern downwards. An array's amplitude has its phase reference at the array's centre and can be negative.
+        For an array, both angles steer the beam through the phases of the elements. For a single antenna, the downtilt
+        shifts the pattern downwards. An array's amplitude has its phase reference at the array's centre and can be
+        negative.
         """
         if not self.antenna.is_array:
-            # Zenith angles increase downwards, so the shifted pattern is the given one at `zenith - downtilt`.
+            # Zenith angles increase downwards, so the shifted pattern is the given pattern at `zenith - downtilt`.
             return self.element(xp.clip(zenith - downtilt, 0.0, np.pi), azimuth, xp)
         return self.element(zenith, azimuth, xp) * array_factor(
             self.antenna, zenith, azimuth, downtilt, steering, xp
@@ -88,7 +89,7 @@ class AntennaPattern:
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
         """Jones vectors [P, ports, 2] in the wave's basis (theta, phi), for directions seen from the antenna [P, 3].
 
-        The waves depart in these directions or, if `arriving`, come from them.
+        The waves depart in these directions or, if `arriving` is true, arrive from these directions.
         """
         to_world = rotation_matrix(self.antenna.orientation)
         local = direction @ to_world
@@ -199,7 +200,7 @@ NEW: Final = "new transmitters"
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Mask of the transmitters that a parameter of `label` affects; those in `own` have parameters of their own."""
+    """Mask of the transmitters that a parameter of `label` affects; those in `own` have separate parameters."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
@@ -232,7 +233,7 @@ class Mounting:
     """The antennas at one end of L links.
 
     Attributes:
-        antennas: The distinct antennas; each orientation is that of the antenna in its mount.
+        antennas: The distinct antennas; each orientation is relative to the mount.
         index: Index of the antenna of every link [L].
         pose: Directions of the antennas [L].
 
@@ -254,7 +255,7 @@ class Mounting:
             )
 
     def of_paths(self, link: NDArray[np.integer]) -> Mounting:
-        """The mounting for paths, from the link of each path [P]."""
+        """Expand the mounting from links to paths, given the link of each path [P]."""
         return Mounting(self.antennas, self.index[link], Pose(*(angle[link] for angle in self.pose)))
 
 
@@ -274,7 +275,7 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
 
 
 def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
-    """Theta vector of departing paths in the frame of their first interaction [P, 2], from mounted transmit antennas.
+    """Theta vector of departing paths in the frame of their first interaction [P, 2], given the transmit antennas.
 
     A path that departs in a perfect null of its antenna has no defined theta vector. In this case, the result is 0, so
     the path has no power with any antenna.
@@ -325,9 +326,9 @@ def antenna_response(
     """Response of a mounted antenna: amplitude, and components (cos, sin) of its theta vector in the waves' basis.
 
     Each result has the shape [P]; the basis is that of `wave_basis`. There is one pose for each path; if `index` [P] is
-    given, paths share poses. `xp` is the array library: NumPy, or `jax.numpy` within a JAX function that is
-    differentiated with respect to the pose. `stored` prevents intermediate values from being computed again at each
-    use.
+    given, it is the index of the pose of each path. `xp` is the array library: NumPy, or `jax.numpy` within a JAX
+    function that is differentiated with respect to the pose. The function `stored` prevents intermediate values from
+    being computed again at each use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)

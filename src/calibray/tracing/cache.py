@@ -87,16 +87,19 @@ def load_trace(digest: str) -> Paths | None:
         return None
     with stream:
         if not _is_trusted(os.fstat(stream.fileno())):
-            _LOG.warning("%s: belongs to another user, or others can write to it; tracing again", path)
+            _LOG.warning(
+                "%s: belongs to another user or is writable by others; the links are traced again", path
+            )
             return None
-        # In a shared folder, another user could replace the file after this check. The open file is therefore read,
-        # if the system has a path for it.
+        # In a shared folder, another user could replace the file after this check. Therefore, the file that is already
+        # open is read if the system provides a path for it.
         opened = Path(f"/proc/self/fd/{stream.fileno()}")
         try:
             return Paths.load(opened if opened.exists() else path)
         except InputError as error:
             _LOG.warning(
-                "Stored trace removed, tracing again: %s", str(error).replace(str(opened), str(path))
+                "A stored trace was removed, and its links are traced again: %s",
+                str(error).replace(str(opened), str(path)),
             )
             with suppress(OSError):
                 path.unlink()
@@ -123,7 +126,7 @@ def store_trace(digest: str, paths: Paths) -> None:
 
 
 def stored_traces() -> list[Path]:
-    """The files of stored traces in the cache folder, latest first."""
+    """The files of stored traces in the cache folder, newest first."""
     folder = cache_folder()
     if folder is None or not folder.is_dir():
         return []

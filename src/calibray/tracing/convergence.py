@@ -1,7 +1,7 @@
 """Checks whether a trace launched enough rays, by tracing again with twice as many rays and a different seed.
 
 Rays find paths by chance. With more rays, fewer paths are missed, and diffuse reflection, an average over rays, has
-less sampling noise. The change in path loss between the two traces is an estimate of the error of the first.
+less sampling noise. The change in path loss between the two traces is an estimate of the error of the first trace.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ PathLoss = Callable[[Paths], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Convergence:
-    """The changes between a trace and one with more rays.
+    """The changes between a trace and a trace with more rays.
 
     Attributes:
         samples: Number of rays per transmitter in the trace that was checked.
-        change_db: Change of each link's path loss with more rays [L], [dB]. It is 0 if neither trace has a path,
-            -inf if only the trace with more rays has one, and +inf if only the checked trace has one.
+        change_db: Change of each link's path loss with more rays [L], [dB]. The change is 0 if neither trace has a
+            path, -inf if only the trace with more rays has a path, and +inf if only the checked trace has a path.
         paths_before: Number of paths of every link in the checked trace [L].
         paths_after: Number of paths of every link with more rays [L].
     """
@@ -39,12 +39,12 @@ class Convergence:
 
     @property
     def gained(self) -> NDArray[np.int64]:
-        """Indices of the links that have more paths than in the checked trace [links]."""
+        """Indices of the links with more paths than in the checked trace [links]."""
         return np.flatnonzero(self.paths_after > self.paths_before)
 
     @property
     def lost(self) -> NDArray[np.int64]:
-        """Indices of the links that have fewer paths than in the checked trace [links]."""
+        """Indices of the links with fewer paths than in the checked trace [links]."""
         return np.flatnonzero(self.paths_after < self.paths_before)
 
     @property
@@ -73,7 +73,7 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
     for name in ("tx_position", "rx_position"):
         if not np.array_equal(getattr(before, name), getattr(after, name)):
             raise InputError(
-                f"the traces have {before.num_links} and {after.num_links} links that differ in {name}; "
+                f"the links of the two traces ({before.num_links} and {after.num_links}) differ in {name}; "
                 "compare traces of the same links"
             )
     loss_before, loss_after = path_loss(before), path_loss(after)
@@ -99,14 +99,14 @@ def check(
         path_loss: Function that returns the path loss of every link [L], [dB].
 
     Raises:
-        InputError: `before` contains other links, or its rays were added in rounds. In the latter case, the last round
-            is the check.
+        InputError: `before` contains other links, or its rays were added in rounds. If rays were added in rounds, the
+            last round is already the check.
         EngineError: There are more paths than the tracer can store.
     """
     if settings.samples == "auto":
         raise InputError(
-            "trace.samples = 'auto' needs no second trace: its last round of rays is the check; the change is in "
-            "settings['last_round_db'] of the paths"
+            "trace.samples = 'auto' needs no second trace, because its last round of rays is the check; the change in "
+            "path loss is in settings['last_round_db'] of the paths"
         )
     # The largest seed is followed by 0.
     next_seed = (settings.seed + 1) % (RANGES["seed"][1] + 1)
@@ -115,7 +115,7 @@ def check(
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:
-    """Join the changes of links that were traced in parts, each with the indices of its links among all links."""
+    """Join the changes of links that were traced in parts; each part states the indices of its links."""
     count = sum(len(links) for links, _ in parts)
     change = np.empty(count)
     before, after = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)

@@ -50,7 +50,7 @@ class TwoCuts:
 
     @property
     def downtilt_deg(self) -> float:
-        """Angle of the main lobe below the horizon [deg]: the mean angle in front with the least attenuation."""
+        """Angle of the main lobe below the horizon [deg]: mean of the angles in front with minimum attenuation."""
         angle = (np.arange(360) + 180) % 360 - 180
         front = np.abs(angle) < 90
         return float(angle[front & (self.vertical_db == self.vertical_db[front].min())].mean())
@@ -79,11 +79,11 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
 
     Each cut states its number of lines. Each line has an angle [deg] and an attenuation [dB]; the lines, in any order,
     cover a full turn in steps of at most 15 degrees. Blanks, tabs and semicolons are separators; decimal commas are
-    accepted. GAIN is in dBd unless its line contains dBi, as the format defines.
+    accepted. According to the format, GAIN is in dBd unless its line contains dBi.
 
     Raises:
-        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line, whose number is in the
-            message.
+        InputError: The file cannot be read, lacks the gain or a cut, or has a malformed line; the message states the
+            line number.
     """
     try:
         lines = Path(path).read_text(encoding="latin-1").splitlines()
@@ -123,7 +123,7 @@ def _gain_dbi(place: str, words: list[str]) -> float:
     if joined is None:
         raise InputError(f"{place}: GAIN {shortened(text)!r}: must be a number, such as 'GAIN 17.5 dBi'")
     value = float(joined.group(1).replace(",", "."))
-    # A unit next to the number, with or without brackets, takes precedence over one in a comment.
+    # A unit next to the number, with or without brackets, takes precedence over a unit in a comment.
     unit = (joined.groups()[-1] or ("dbi" if "dbi" in text.lower() else "dbd")).lower()
     return _cut_in_range(place, "GAIN", value if unit == "dbi" else value + DIPOLE_GAIN_DBI)
 
@@ -160,8 +160,8 @@ def _cut(path: str | Path, first: int, lines: list[str], count: int, key: str) -
     largest = float(np.diff([*angle, angle[0] + 360.0]).max())
     if largest > LARGEST_STEP_DEG:
         raise InputError(
-            f"{path}: {key} has a gap of {largest:g} degrees without a value, must be at most {LARGEST_STEP_DEG:g}; "
-            "export a full turn"
+            f"{path}: {key} has a gap of {largest:g} degrees without a value, but gaps must be at most "
+            f"{LARGEST_STEP_DEG:g}; export a full turn"
         )
     return np.interp(np.arange(360.0), angle, pairs[order, 1], period=360.0)
 
@@ -181,11 +181,11 @@ def _cut_in_range(place: str, name: str, value: float) -> float:
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
 LARGEST_EFFICIENCY: Final = 1.5
-"""Largest ratio of radiated to accepted power at which the values are accepted as absolute gains [1]."""
+"""Maximum ratio of radiated to accepted power at which the values are accepted as absolute gains [1]."""
 SEAM_TOLERANCE_DB: Final = 0.1
-"""Largest difference between the gain at the first azimuth and that of the same direction a full turn later [dB]."""
+"""Maximum difference between the gains at the first azimuth and at the same direction a full turn later [dB]."""
 _STEP_TOLERANCE: Final = 0.01
-"""Largest relative difference between a step and the median step."""
+"""Maximum relative difference between a step and the median step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ class GainTable:
     Attributes:
         first_azimuth_deg: Azimuth of the first column [deg], from the antenna's x axis towards its y axis.
         gain_dbi: Gain [elevations, azimuths], [dBi]. Elevations run from -90 to 90 degrees in equal steps, including
-            the ends. Azimuths run in equal steps around a full turn, without its end.
+            the ends. Azimuths run in equal steps around a full turn, excluding the end of the turn.
 
     Example:
         >>> GainTable(-180.0, np.zeros((181, 360))).efficiency
@@ -272,8 +272,8 @@ def read_gain_table(path: str | Path) -> GainTable:
     row, low, high = _axis(table, "elevation_deg", elevation)
     if (low, high) != (-90.0, 90.0):
         raise InputError(
-            f"{path}: elevation_deg runs from {low:g} to {high:g}, must run from -90 to 90; add the missing "
-            "directions (principal cuts alone are not enough)"
+            f"{path}: elevation_deg runs from {low:g} to {high:g}, but must run from -90 to 90; add the "
+            "missing directions (principal cuts alone are not enough)"
         )
     column, first, last = _axis(table, "azimuth_deg", azimuth)
     count = column.max() + 1
@@ -281,8 +281,8 @@ def read_gain_table(path: str | Path) -> GainTable:
     step = (last - first) / (count - 1)
     if not closed and abs(last - first + step - 360) > _STEP_TOLERANCE * step:
         raise InputError(
-            f"{path}: azimuth_deg runs from {first:g} to {last:g} in steps of {step:g}, must cover a full turn, "
-            "such as -180 to 180 or 0 to 360; add the missing directions (principal cuts alone are not enough)"
+            f"{path}: azimuth_deg runs from {first:g} to {last:g} in steps of {step:g}, but must cover a full "
+            "turn, such as -180 to 180 or 0 to 360; add the missing directions (principal cuts alone are not enough)"
         )
     gains = np.full((row.max() + 1, count), np.nan)
     gains[row, column] = gain
@@ -295,14 +295,15 @@ def read_gain_table(path: str | Path) -> GainTable:
             line = int(np.flatnonzero((row == worst) & (column == count - 1))[0])
             raise InputError(
                 f"{table.cell(line, 'gain_dbi')}: {gain[line]:g} differs from the gain at azimuth "
-                f"{first:g}, {gains[worst, 0]:g}, which is the same direction; correct one"
+                f"{first:g}, {gains[worst, 0]:g}, which is the same direction; correct one of the two"
             )
         gains = gains[:, :-1]
     gain_table = GainTable(first, gains)
     if gain_table.efficiency > LARGEST_EFFICIENCY:
         raise InputError(
             f"{path}: an antenna with these gains would radiate {gain_table.efficiency:.3g} times the power that it "
-            f"accepts, must be at most {LARGEST_EFFICIENCY:g}; give absolute gains [dBi], not relative levels"
+            f"accepts, but the factor must be at most {LARGEST_EFFICIENCY:g}; give absolute gains [dBi], "
+            "not relative levels"
         )
     return gain_table
 
@@ -343,7 +344,8 @@ def _axis(
         )
     if step > LARGEST_STEP_DEG * (1 + _STEP_TOLERANCE):
         raise InputError(
-            f"{table.source}: {name} has steps of {step:g}, must be at most {LARGEST_STEP_DEG:g}; give a finer grid"
+            f"{table.source}: {name} has steps of {step:g}, but steps must be at most {LARGEST_STEP_DEG:g}; give a "
+            "finer grid"
         )
     return np.round((values - axis[0]) / step).astype(np.int64), float(axis[0]), float(axis[-1])
 
@@ -355,8 +357,8 @@ def _refuse_repeats(table: SourceTable, cell: NDArray[np.int64]) -> None:
     if len(repeats):
         first, second = order[repeats[0]], order[repeats[0] + 1]
         raise InputError(
-            f"{table.source}, row {table.row[second]}: the same direction as row {table.row[first]} "
-            f"({len(repeats)} in all); remove one"
+            f"{table.source}, row {table.row[second]}: has the same direction as row {table.row[first]} "
+            f"(repeated directions: {len(repeats)}); remove one of the two"
         )
 
 

@@ -1,6 +1,6 @@
-"""Chooses whether the ray tracer runs on a GPU; if not, chooses the libLLVM with which Dr.Jit compiles its kernels.
+"""Decides whether the ray tracer runs on a GPU; if not, chooses the libLLVM with which Dr.Jit compiles its kernels.
 
-Without CUDA, Dr.Jit takes the newest libLLVM that it finds, and an incompatible version aborts the whole process. The
+Without CUDA, Dr.Jit loads the newest libLLVM that it finds, and an incompatible version aborts the whole process. The
 choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate process, and
 `DRJIT_LIBLLVM_PATH` is set to the best library.
 
@@ -27,12 +27,12 @@ PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST_MAJOR = 17
 """Oldest accepted major version.
 
-Dr.Jit 1.5 rejects version 14 and older, and aborts on x86 with 15 and 16 ("Cannot select: fminimum"). LLVM has compiled
-`llvm.minimum` for x86 since version 17 (reviews.llvm.org D145634 and D148691).
+Dr.Jit 1.5 rejects LLVM 14 and older versions, and aborts on x86 with LLVM 15 and 16 ("Cannot select: fminimum"). LLVM
+has compiled `llvm.minimum` for x86 since version 17 (reviews.llvm.org D145634 and D148691).
 """
 
 TESTED_MAJORS = frozenset({19, 22})
-"""Major versions with which Sionna RT 2.2 was tested; others are accepted with a note."""
+"""Major versions with which Sionna RT 2.2 was tested; other versions are accepted with a note."""
 
 PROBE_TIMEOUT = 30.0
 """Time limit for opening one library [s]."""
@@ -49,8 +49,8 @@ _FOLDERS = (
     "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
 )
 
-# Matches libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1 and libLLVM.dylib, but not libLLVM-C.dylib or
-# libLLVMSupport.so, which are parts of LLVM.
+# The pattern matches libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1 and libLLVM.dylib, but not libLLVM-C.dylib
+# or libLLVMSupport.so, which are parts of LLVM.
 _NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.(?:so(?:\.(\d+)[\d.]*)?|dylib)")
 
 # LLVMGetVersion has existed since LLVM 16; without it, nothing is printed.
@@ -121,7 +121,7 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decide whether Dr.Jit can use an opened library; `reported` is the version that it reports, or empty."""
+    """Decide whether Dr.Jit can use an opened library, given the version that the library reports (empty if none)."""
     version = reported or version_in_name(path)
     if not reported and (not version or version[0] >= 16):
         return Llvm(path, (), "it reports no LLVM version, unlike every libLLVM since version 16")
@@ -131,7 +131,7 @@ def judge(path: str, reported: tuple[int, ...]) -> Llvm:
 
 
 def inspect(path: str) -> Llvm:
-    """Open a library, given by path or bare name, in a separate process, because a broken library can abort it."""
+    """Open a library (path or bare name) in a separate process, because a broken library can abort the process."""
     output, problem = _probe(_VERSION_PROBE, path)
     if problem is not None:
         return Llvm(path, version_in_name(path), f"it cannot be opened ({problem})")
@@ -205,7 +205,7 @@ def mitsuba_variant() -> str:
 
 
 def prepare() -> str:
-    """Make Dr.Jit safe to import: choose the libLLVM if it needs one, and return the Mitsuba variant to set first.
+    """Make Dr.Jit safe to import: choose a libLLVM if there is no usable GPU, and return the Mitsuba variant to set.
 
     Raises:
         InputError: libatomic is missing, or there is no usable GPU and `select` finds no usable library.
@@ -218,7 +218,7 @@ def prepare() -> str:
 
 
 def require_libatomic() -> None:
-    """Raise an error on Linux without libatomic: Dr.Jit links to it, and minimal Debian installations lack it.
+    """Raise an error on Linux without libatomic, which Dr.Jit needs and minimal Debian installations lack.
 
     Raises:
         InputError: The library cannot be opened.

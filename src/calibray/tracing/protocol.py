@@ -1,8 +1,8 @@
 """The interface to ray tracers: the methods that Calibray calls, and the form in which a tracer returns its paths.
 
 A tracer only has to compute the geometry. It returns its paths as `calibray.paths.chains.Chains`, with the material of
-every interaction. `compile_paths` combines them with the antennas into the path program that all further computations
-use.
+every interaction. `compile_paths` combines these paths with the antennas into the path program that all further
+computations use.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Tracer(Protocol):
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        """Find the paths of every link; `materials` replace those of the scene by name.
+        """Find the paths of every link; `materials` override, by material name, the constants of the scene.
 
         `progress` is called with ("tracing", receivers traced, number of receivers).
 
@@ -110,11 +110,11 @@ class Tracer(Protocol):
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with the tracer's own field computation.
 
-        A tracer without its own field computation can replay the paths with `calibray.path_gains`. `materials` replace
-        those of the scene by name.
+        A tracer without its own field computation can replay the paths with `calibray.path_gains`. `materials`
+        override, by material name, the constants of the scene.
 
         Raises:
-            InputError: As for `trace`.
+            InputError: The links or materials are invalid, as described in `trace`.
             EngineError: The paths do not fit into memory.
         """
         ...
@@ -161,7 +161,8 @@ def compile_paths(
     """Compile the paths that a tracer found, in any order, into a path program.
 
     The order of `materials` defines the material indices in `chains`. `link` [P] is the link of every path, and `ends`
-    contains the positions of all links. The program's paths are ordered by link, and within a link as given.
+    contains the positions of all links. The paths of the program are ordered by link; within a link, they keep the
+    given order.
     """
     geometry = compile_chains(chains)
     departure, arrival = geometry.departure_direction, geometry.arrival_direction
@@ -175,7 +176,7 @@ def compile_paths(
         delay=geometry.delay,
         spreading=geometry.spreading,
         departure=zenith_azimuth(departure),
-        # The wave travels along `arrival`; from the receiver, it comes from the opposite direction.
+        # The wave travels along `arrival`; seen from the receiver, it comes from the opposite direction.
         arrival=zenith_azimuth(-arrival),
         tx_field=rotate_jones(tx_pattern.jones_vectors(departure), geometry.departure_rotation),
         # The inverse rotation transforms the receive pattern from the basis of arrival into the last frame.
@@ -202,7 +203,8 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
     """
     if not (hasattr(links, "tx") and hasattr(links, "rx")):
         raise InputError(
-            f"links: is a {type_name(links)}, must have positions tx and rx, such as Measurements(tx, rx, path_loss_db)"
+            f"links: is a {type_name(links)}, but must have positions tx and rx, such as Measurements(tx, rx, "
+            "path_loss_db)"
         )
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
     if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
@@ -256,9 +258,9 @@ class EnclosedAntennas:
         tx_below: NDArray[np.bool_] | None = None,
         rx_below: NDArray[np.bool_] | None = None,
     ) -> EnclosedAntennas:
-        """Collect the rows of the source file, from the row of each link and the masks of enclosed antennas [L].
+        """Collect the rows of the source file, given the row of each link and the masks of enclosed antennas [L].
 
-        Antennas that are also in the mask of antennas below the ground [L] are collected only there.
+        Antennas that are also in a mask of antennas below the ground [L] are listed only as below the ground.
         """
         under = [np.zeros(len(row), dtype=bool) if mask is None else mask for mask in (tx_below, rx_below)]
         tx, rx = tx & ~under[0], rx & ~under[1]

@@ -14,9 +14,9 @@ from calibray.tracing.gain_table import is_gain_file, read_gain_table
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
 LARGEST_ARRAY: Final = 64
-"""Largest number of rows or columns of an array."""
+"""Maximum number of rows or columns of an array."""
 LARGEST_SPACING: Final = 10.0
-"""Largest spacing between the antennas of an array [wavelengths]."""
+"""Maximum spacing between the antennas of an array [wavelengths]."""
 
 AUTO: Final = "auto"
 """Value of `samples` that lets the tracer choose the number of rays."""
@@ -32,7 +32,7 @@ class TraceSettings:
     """Settings of the tracer, with the same meaning as in Sionna RT.
 
     Attributes:
-        max_depth: Largest number of interactions of a path, 0 to 100.
+        max_depth: Maximum number of interactions of a path, 0 to 100.
         line_of_sight: Find the direct path.
         specular_reflection: Follow specular reflections.
         refraction: Follow transmission through surfaces.
@@ -40,8 +40,8 @@ class TraceSettings:
         edge_diffraction: Also follow diffraction at free edges.
         diffraction_lit_region: Keep diffracted paths to receivers in the lit region as well as in the shadow.
         diffuse_reflection: Follow diffuse reflections.
-        samples: Rays per transmitter, 1 to 10^12; with "auto", rays are added in rounds until path loss converges,
-            which is not possible with diffuse reflection.
+        samples: Rays per transmitter, 1 to 10^12. With "auto", rays are added in rounds until path loss converges;
+            "auto" cannot be combined with diffuse reflection.
         seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
@@ -76,8 +76,8 @@ class TraceSettings:
 
         if self.diffuse_reflection and self.adaptive:
             raise InputError(
-                "trace.samples = 'auto' adds rays until path loss converges, which is not possible with diffuse "
-                "reflection, an average over rays; give a number, or diffuse_reflection = false"
+                "trace.samples = 'auto' cannot be combined with diffuse reflection, which is an average over rays; "
+                "give a number, or set diffuse_reflection = false"
             )
 
     @property
@@ -105,8 +105,8 @@ class Antenna:
             antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
         rows: Number of rows of a planar array of these antennas along its z axis; one signal feeds all antennas.
-        columns: Number of columns along its y axis.
-        spacing: Horizontal and vertical spacing of its antennas [wavelengths].
+        columns: Number of columns of the array along the antenna's y axis.
+        spacing: Horizontal and vertical spacing of the antennas of the array [wavelengths].
 
     Raises:
         InputError: The pattern or polarization is unknown, the orientation is not three numbers, or the array size is
@@ -187,10 +187,10 @@ class Antenna:
 def as_antenna(value: Antenna | Mapping[str, object] | None, name: str = "antenna") -> Antenna:
     """Make an antenna from a mapping of its attributes or from None (the default); an antenna is returned unchanged.
 
-    Error messages call it `name`.
+    Error messages refer to the antenna as `name`.
 
     Raises:
-        InputError: The value is none of these, or an attribute is unknown or invalid.
+        InputError: The value is not an antenna, a mapping or None, or an attribute is unknown or invalid.
     """
     if value is None:
         return Antenna()
@@ -198,7 +198,7 @@ def as_antenna(value: Antenna | Mapping[str, object] | None, name: str = "antenn
         return value
     if not isinstance(value, Mapping):
         raise InputError(
-            f"{name}: is {shortened(repr(value))}, must be an Antenna or its attributes, such as "
+            f"{name}: is {shortened(repr(value))}, but must be an Antenna or its attributes, such as "
             '{"pattern": "dipole"}'
         )
     unknown = set(value) - {field.name for field in fields(Antenna)}

@@ -4,7 +4,7 @@ A launch sends rays from one transmitter and searches for paths to several recei
 (`starts_at_receivers`). Below, *transmitter* means the end that sends the rays. The tracer stores data for every
 combination of ray, interaction and receiver, called a *lane*. The receivers of a transmitter are therefore split over
 launches; if one receiver needs too many lanes, the rays are split as well. Sionna's rays form a lattice of directions
-that does not depend on the seed. Each launch gets a share of the lattice, so all launches together send the same rays
+that does not depend on the seed. Each launch uses a share of the lattice, so all launches together send the same rays
 as a single launch would.
 """
 
@@ -17,7 +17,7 @@ from typing import Final, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.support.messages import duration
+from calibray.support.messages import counted, duration
 from calibray.tracing.settings import TraceSettings
 
 LONG_TRACE_SECONDS: Final = 30.0
@@ -35,9 +35,10 @@ LANES_PER_SECOND: Final = 3e7
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
 SMALL_LAUNCH: Final = 5_000_000
-"""Largest number of lanes of a small launch, which finds a few thousand candidate paths and takes at most 0.4 s."""
+"""Maximum number of lanes of a small launch, which finds a few thousand candidate paths and takes at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
-"""Side of the grid cells for comparing interaction points [m]; points of different paths are seldom so close."""
+"""Side length of the grid cells for comparing interaction points [m]; points of different paths are rarely this
+close."""
 
 
 @dataclass(frozen=True)
@@ -126,14 +127,16 @@ class TracePlan:
         """One line on the expected cost of tracing `links` links; empty for a single short launch."""
         if len(self.launches) == 1 and self.seconds < SHORT_TRACE_SECONDS:
             return ""
+        task = f"Tracing {counted(links, 'link')}"
         if self.adaptive:
             return (
-                f"Tracing {links:,} links from {len(self.launches):,} positions, adding rays until path loss "
-                f"converges; about {duration(self.seconds)} on two cores, longer while rays still find paths"
+                f"{task} from {counted(len(self.launches), 'position')}, adding rays until path loss converges; this "
+                f"takes about {duration(self.seconds)} on two cores, or longer if new paths are still found"
             )
+        launches = "1 launch" if len(self.launches) == 1 else f"{len(self.launches):,} launches"
         return (
-            f"Tracing {links:,} links in {len(self.launches):,} launches of up to {self.lanes:,} rays x interactions x "
-            f"receivers; about {self.memory / 2**30:.1f} GiB of memory, plus that of the scene and the paths, "
+            f"{task} in {launches} of up to {self.lanes:,} rays x interactions x "
+            f"receivers; this takes about {self.memory / 2**30:.1f} GiB, plus the memory of the scene and the paths, "
             f"and {duration(self.seconds)} on two cores"
         )
 
@@ -196,7 +199,7 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
 
 
 def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
-    """Repeat the last receiver [n, 3], so that launches have only a few different numbers of receivers.
+    """Repeat the last receiver [n, 3] so that only a few distinct receiver counts occur across launches.
 
     The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is increased to a power
     of two, or to a multiple of the largest power of two for which a launch is small.

@@ -1,6 +1,6 @@
-"""Making scenes from OpenStreetMap extracts, vector files, height models and floor plans.
+"""Makes scenes from OpenStreetMap extracts, vector files, height models and floor plans.
 
-Names are imported on first use, because each kind of source needs different libraries.
+Each name is imported on first use, because different kinds of source need different libraries.
 """
 
 from typing import TYPE_CHECKING

@@ -1,13 +1,14 @@
 """Extrusion of buildings into walls, windows, roofs and undersides.
 
-The ground is divided into adjacent cells. Each cell lists the buildings that cover it, with their bottoms and tops. At
-heights where buildings overlap, the taller building is used. Mapped parts of a building replace its outline. Adjacent
-cells have the same corners along their common border, so walls and roofs that meet share their vertices.
+The ground is divided into adjacent cells. Each cell lists the buildings that cover it and the heights of their bottoms
+and tops. At heights where buildings overlap, the taller building is used. If the map contains the parts of a building,
+these parts replace the outline of the building. Adjacent cells have the same corners along their common border, so
+walls and roofs that meet share their vertices.
 
-A border has a wall at the heights at which a building stands on only one of its sides. Between buildings of different
-heights, the wall begins at the lower roof. Between buildings of equal height, there is no wall. All walls that meet at
-an end of a border use the same column of corners, so the surface is closed and its wedges are connected. Coordinates
-are whole millimetres, so corners are either identical or clearly different.
+A border has a wall at every height at which there is a building on only one side of the border. Between buildings of
+different heights, the wall begins at the lower roof. Between buildings of equal height, there is no wall. All walls
+that meet at an end of a border use the same column of corners, so the surface is closed and its wedges are connected.
+Coordinates are whole millimetres, so corners are either identical or clearly different.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ Interval = tuple[float, float, int]
 Length = TypeVar("Length", int, float)
 
 THINNEST: Final = GRID / 2
-"""Smallest thickness of an interval [m]; thinner ones are rounding artefacts and are dropped."""
+"""Minimum thickness of an interval of heights [m]; thinner intervals are rounding artefacts and are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """An area of ground, a shapely Polygon [m], and the buildings on it, in order of height and without overlap."""
+    """An area of ground (a shapely Polygon [m]) and the buildings on it, sorted by height and without overlap."""
 
     polygon: Any
     stands: tuple[Interval, ...]
@@ -48,9 +49,9 @@ class Cell:
 def split_overlaps(
     footprints: Footprints, bottom: NDArray[np.float64], top: NDArray[np.float64]
 ) -> tuple[list[Cell], int]:
-    """Divide buildings into cells, given the bottom and top of each building in the scene frame [n], [m].
+    """Divide the area of buildings into cells, given the bottom and top of each building in the scene frame [n], [m].
 
-    Returns the cells, and the number of footprints that overlap another footprint.
+    Returns the cells and the number of footprints that overlap another footprint.
     """
     shapely = library("shapely", "scenes")
     tree = shapely.STRtree(footprints.polygon)
@@ -95,7 +96,7 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
 
 
 def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Assign each height at which buildings overlap to the building with the highest top."""
+    """Assign every range of heights in which buildings overlap to the building with the highest top."""
     stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
         free = [(bottom, top, owner)]
@@ -108,7 +109,7 @@ def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
 def subtract(
     interval: tuple[Length, Length, int], bottom: Length, top: Length
 ) -> list[tuple[Length, Length, int]]:
-    """Subtract a range of heights from an interval, which leaves up to two intervals of the same owner.
+    """Subtract a range of heights from the interval of a building, which leaves up to two intervals of this building.
 
     Example:
         >>> subtract((0.0, 10.0, 7), 2.0, 4.0)
@@ -133,8 +134,8 @@ Strips = dict[Edge, list[tuple[Point, int]]]  # start and kind of each strip of 
 class Windows:
     """Division of outer walls into alternating vertical strips of wall and window, with wall at both ends.
 
-    The strips are as high as the wall, so the fraction of windows is the same at every height. With a strip of wall at
-    both ends, each wedge at a corner of the building consists of one material.
+    The strips are as high as the wall, so windows cover the same fraction of the wall at every height. With a strip of
+    wall at both ends, each wedge at a corner of the building consists of one material.
 
     Attributes:
         share: Fraction of each wall that is covered by windows, at least 0 and less than 1 [1].
@@ -180,7 +181,7 @@ class Shell:
 
     Attributes:
         corners: Corners of each triangle, counter-clockwise when seen from outside [F, 3, 3], [mm].
-        owner: Index of the building of each triangle [F].
+        owner: Index of the building to which each triangle belongs [F].
         kind: `WALL`, `WINDOW`, `ROOF` or `UNDERSIDE` [F].
     """
 
@@ -253,13 +254,14 @@ def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int]
 
 
 def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
-    """Strips of all edges that have a wall; the two directions of an edge have the same corners."""
+    """Strips of all edges that have a wall; both directions of an edge use the same corners."""
     if windows is None or windows.share == 0:
         return {}
     strips: Strips = {}
     for edge, stands in walls.items():
         if stands:
-            # Divided in one direction only, because rounding from the other end could differ by a millimetre.
+            # Each edge is divided in one direction only, because rounding from the other end could differ by a
+            # millimetre.
             start, end = min(edge), max(edge)
             forward = windows.divide((start, end))
             ends = [*(point for point, _ in forward[1:]), end]
@@ -269,7 +271,7 @@ def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
 
 
 def _columns(walls: dict[Edge, list[Stand]], strips: Strips) -> dict[Point, list[int]]:
-    """Heights at which the walls that meet at each corner begin or end [mm], ascending."""
+    """Heights [mm], in ascending order, at which the walls that meet at each corner begin or end."""
     levels: dict[Point, set[int]] = defaultdict(set)
     for (start, end), stands in walls.items():
         heights = {height for low, high, _ in stands for height in (low, high)}
@@ -316,7 +318,7 @@ def _lids(
     corners, owner, kind = [np.zeros((0, 3, 3), dtype=np.int64)], [], []
     for index, stands in enumerate(standing):
         flat = triangles[first[index] : first[index + 1]]
-        # Where a body touches the next one above or below it, there is no roof or underside.
+        # Where two bodies touch, one above the other, there is no roof or underside.
         bottoms, tops = {low for low, _, _ in stands}, {high for _, high, _ in stands}
         lids = [(high, building, ROOF) for _, high, building in stands if high not in bottoms]
         lids += [

@@ -30,11 +30,12 @@ OPENINGS: Final = frozenset({"door", "window"})
 """Types of segments that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
-"""Smallest and largest thickness of a wall [m]; other values suggest that thickness and coordinates have different
+"""Minimum and maximum thickness of a wall [m]; other values suggest that thickness and coordinates have different
 units."""
 
 USUAL_EXTENT: Final = (2.0, 300.0)
-"""Usual range of plan extents [m]; outside it, a warning recommends stating the unit. Large halls are 300 m long."""
+"""Usual range of plan extents [m]; outside this range, a warning recommends stating the unit. Large halls are
+300 m long."""
 
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
 """Extensions of vector files; any other file is read as CSV."""
@@ -59,7 +60,7 @@ _OTHER_NAMES: Final = {
 
 @dataclass(frozen=True)
 class Segment:
-    """A vertical rectangle over a line of a plan.
+    """A vertical rectangle that stands on a line of a plan.
 
     Attributes:
         start: x and y of one end [m].
@@ -68,7 +69,7 @@ class Segment:
         bottom: Height of the bottom [m].
         top: Height of the top [m].
         thickness: Thickness [m]; None if unknown.
-        source: The plan, as messages name it.
+        source: Name of the plan in messages.
     """
 
     start: tuple[float, float]
@@ -96,12 +97,12 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
 
     Args:
         path: A text table with the columns x0, y0, x1, y1 and type. Instead of the coordinates, a column wkt can
-            contain lines, polylines or outlines; the columns thickness, bottom and height are optional. Similar names
-            are recognized, and a unit of length in a name, as in `width_cm`, applies to that column. The file can also
-            be a DXF, GeoJSON or other vector file in the plan's coordinates. Its attributes must have exactly these
-            names, with or without a unit. If there is no attribute type, the DXF layer is used as the type. Points and
-            text in vector files are ignored.
-        height: Height of the top of segments without a height [m].
+            contain lines, polylines or outlines. The columns thickness, bottom and height are optional. Similar column
+            names are recognized, and a unit of length in a column name, as in `width_cm`, applies to that column. The
+            file can also be a DXF, GeoJSON or other vector file in the plan's coordinates. The attributes of a vector
+            file must have exactly these names, with or without a unit. If a DXF file has no attribute type, the name of
+            the layer is used as the type. Points and text in vector files are ignored.
+        height: Height of the top of each segment for which the plan states no height [m].
         unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file, or
             metres.
 
@@ -142,13 +143,13 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         size = float(np.abs(points).max())
         if size > WIDEST or max(abs(bottom), extent, thickness) > HIGHEST:
             raise InputError(
-                f"{row}: {size:g} m from the origin, {extent:g} m high and {thickness:g} m thick; must be at most "
-                f"{WIDEST:g} m from the origin, {HIGHEST:g} m high and thick; correct the row or its unit"
+                f"{row}: {size:g} m from the origin, {extent:g} m high and {thickness:g} m thick; the segment must "
+                f"be at most {WIDEST:g} m from the origin, {HIGHEST:g} m high and thick; correct the row or its unit"
             )
         if not (np.isnan(thickness) or THICKNESS[0] <= thickness <= THICKNESS[1]):
             raise InputError(
-                f"{row}: thickness = {thickness:g} m, must be {THICKNESS[0]:g} to {THICKNESS[1]:g} m; state its unit "
-                "in the name of the column, such as thickness_cm, or the plan's unit (--unit 0.01 for cm)"
+                f"{row}: thickness = {thickness:g} m, but must be {THICKNESS[0]:g} to {THICKNESS[1]:g} m; state its "
+                "unit in the name of the column, such as thickness_cm, or the plan's unit (--unit 0.01 for cm)"
             )
         stated = None if np.isnan(thickness) else thickness
         segments += [
@@ -274,7 +275,8 @@ def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.flo
         return np.full(len(frame), np.nan)
     column = frame[name]
     if column.dtype == object:
-        # pandas keeps long integers as Python integers, which overflow a float; parsed from text, they become infinite.
+        # pandas keeps long integers as Python integers, which overflow a float; when parsed from text, long integers
+        # become infinite.
         column = column.astype("string")
     values = pd.Series(pd.to_numeric(column, errors="coerce")).to_numpy(dtype=np.float64, na_value=np.nan)
     if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:

@@ -44,19 +44,19 @@ TYPES: Final = {
     "floor": SurfaceMaterial("floor", "concrete", 0.2),
     "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
 }
-"""Materials of types that are not named after ITU-R P.2040 materials."""
+"""Materials of the types whose names are not names of ITU-R P.2040 materials."""
 
 LIDS: Final = ("floor", "ceiling")
 """Horizontal sheets over the whole area of a plan."""
 
 WALL_THICKNESS: Final = 0.12
-"""Thickness of a wall made of an ITU material if the plan states no thickness [m]."""
+"""Thickness of a wall of an ITU material, used if the plan states no thickness [m]."""
 
 STOREY: Final = 1.8
-"""Smallest height of a storey [m]; lower pieces of wall, such as parapets, do not count as storeys."""
+"""Minimum height of a storey [m]; lower pieces of wall, such as parapets, do not count as storeys."""
 
 ROUNDING: Final = 2.0
-"""Largest distance [mm] by which rounding moves the corner of two crossing walls off the line of either wall."""
+"""Maximum distance [mm] by which rounding can move the corner of two crossing walls off the line of either wall."""
 
 _REACH: Final = 0.03  # largest distance from a wall's face at which the end of another wall meets it [m]
 
@@ -85,8 +85,8 @@ def make_plan_scene(
         types: Materials by type, which extend or replace those in `TYPES`. A type that is an ITU-R P.2040 material,
             such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one type,
             each becomes a separate material.
-        lids: Which of `LIDS` to make. They cover the whole area that walls enclose; the floor is at the lowest bottom
-            and the ceiling at the highest top.
+        lids: Which of `LIDS` to make. A floor or ceiling covers the whole area that walls enclose; the floor is at the
+            lowest bottom of the walls, and the ceiling at their highest top.
         merge: Whether to merge two parallel lines into one wall (`merge_faces`).
         overwrite: Whether to replace files that Calibray did not write.
 
@@ -102,7 +102,7 @@ def make_plan_scene(
     sheets, source = merged.sheets, segments[0].source
     if lids and (level := _separation(sheets)) is not None:
         raise InputError(
-            f"{source}: a storey begins at {level:g} m, where the scene would have no floor; make a separate scene "
+            f"{source}: a storey begins at {level:g} m, but the scene would have no floor there; make a separate scene "
             "of each storey, or omit floor and ceiling (--no-floor --no-ceiling) and add the floors to the scene "
             "yourself"
         )
@@ -148,7 +148,8 @@ def _materials(
             base = types[sheet.kind]
         else:
             base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
-        # Rounded to a thousandth of a millimetre, so that rounding errors do not give separate materials.
+        # The thickness is rounded to a thousandth of a millimetre, so that rounding errors do not create separate
+        # materials.
         stated = base.thickness if sheet.thickness is None else round(sheet.thickness, 6)
         materials.append(replace(base, thickness=stated))
     thicknesses: dict[str, set[float]] = defaultdict(set)
@@ -237,7 +238,7 @@ def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
 
 
 def _wall_objects(pieces: Pieces) -> list[MeshObject]:
-    """One mesh per material; sheets of one material that meet share their corners."""
+    """One mesh per material; where sheets of the same material meet, they share their corners."""
     levels: dict[Point, set[int]] = defaultdict(set)
     for edge, stands in pieces.items():
         for point in edge:

@@ -34,7 +34,7 @@ SMALLEST: Final = 1.0
 """Smallest area of a building [m^2]."""
 
 HIGHEST: Final = 1000.0
-"""Largest height of a building or of a part of a building [m]; the world's tallest building is 828 m high."""
+"""Maximum height of a building or building part [m]; the world's tallest building is 828 m high."""
 
 HeightSource = Literal["height", "levels", "default"]
 
@@ -139,7 +139,7 @@ class Footprints:
         return library("shapely", "scenes").total_bounds(self.polygon)
 
     def guessed(self) -> dict[HeightSource, list[str]]:
-        """Names of the buildings whose height is assumed, by the source of the assumption."""
+        """Names of the buildings with an assumed height, grouped by the source of the assumption."""
         guesses: dict[HeightSource, list[str]] = {"levels": [], "default": []}
         for name, source in zip(self.name, self.height_from, strict=True):
             if source != "height":
@@ -235,8 +235,8 @@ def read_openstreetmap(
 ) -> tuple[Footprints, Frame]:
     """Read the buildings of an extract: closed ways and multipolygon relations tagged `building` or `building:part`.
 
-    Returns the footprints and their frame, by default a local frame centred on the buildings. `rule` contains the
-    assumptions for heights that the map does not state.
+    Returns the footprints and their frame, which by default is a local frame centred on the buildings. `rule` contains
+    the assumptions for heights that the map does not state.
 
     Raises:
         InputError: The file does not exist, is not an extract or contains no building, or pyosmium is not installed.
@@ -271,7 +271,7 @@ def read_openstreetmap(
     frame = frame or _local_frame(degrees, WGS84)
     bottoms, tops, sources = zip(*(rule.heights(building) for building in tags), strict=True)
     incomplete = announced - len(outlines)
-    # Stated heights or numbers of storeys, such as "~25", that a less reliable source replaces.
+    # Stated heights or numbers of storeys that cannot be used, such as "~25"; a less reliable source replaces them.
     unused = [
         building[key]
         for building, source in zip(tags, sources, strict=True)
@@ -297,10 +297,10 @@ def read_openstreetmap(
 
 @dataclass(frozen=True)
 class FootprintColumns:
-    """Columns of a vector file, other than the heights of buildings.
+    """Columns of a vector file other than the column of building heights.
 
     Attributes:
-        bottom: Column with the heights of the bottoms of buildings [m], or one height for all.
+        bottom: Column with the heights of the bottoms of buildings [m], or one height for all buildings.
         name: Column with the names of buildings; buildings without a name are numbered.
         levels: Column with the numbers of storeys, for buildings without a height.
     """
@@ -325,15 +325,15 @@ def read_footprints(
             reference system.
         height: Column with the heights of the buildings above the ground, in metres or the unit in its name
             (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is interpreted
-            as the name. It can be None if `columns` names a column of numbers of storeys.
+            as the name. The height can be None if `columns` names a column of numbers of storeys.
         columns: Additional columns.
         layer: Layer of the file, if it has more than one.
-        frame: The scene's frame; by default a local frame centred on the footprints.
+        frame: The scene's frame; by default, a local frame centred on the footprints.
         rule: Assumptions for buildings without a stated height.
 
     Raises:
         InputError: The file does not exist, cannot be read, states no coordinate reference system, lacks a column or
-            contains no polygon; or a height is missing, negative or not a number.
+            contains no polygon. A height is missing, negative or not a number.
     """
     path, rule, named = Path(path), rule or HeightRule(), columns or FootprintColumns()
     outlines, table, crs = _read(path, layer)
@@ -419,7 +419,7 @@ def _numbers(
     count: int,
     quantity: str = "a length in metres",
 ) -> NDArray[np.float64]:
-    """Read numbers [count] from a column, or repeat a constant; NaN where the column has no value.
+    """Read numbers [count] from a column, or repeat a constant; missing values of the column become NaN.
 
     Numbers are in metres, or in the unit stated in the name of the column. Text is parsed as a length.
 
@@ -438,8 +438,8 @@ def _numbers(
         for number, (value, length) in enumerate(zip(values, lengths, strict=True), start=1):
             if value and length is None:
                 raise InputError(
-                    f"footprints {path}, polygon {number}: {source} = {shortened(repr(value))}, must be {quantity}; "
-                    "correct it, or leave it empty"
+                    f"footprints {path}, polygon {number}: {source} = {shortened(repr(value))}, but must be "
+                    f"{quantity}; correct it, or leave it empty"
                 )
         stated = [1.0 if value is None or not _is_number(str(value)) else unit for value in values]
         values, unit = np.array([np.nan if length is None else length for length in lengths]) * stated, 1.0
@@ -449,7 +449,7 @@ def _numbers(
     )
     if bad.size:
         raise InputError(
-            f"footprints {path}, polygon {bad[0] + 1}: {source} = {numbers[bad[0]]:g}, must be finite, not "
+            f"footprints {path}, polygon {bad[0] + 1}: {source} = {numbers[bad[0]]:g}, but must be finite, not "
             f"negative and at most {HIGHEST:g}; correct it"
         )
     return numbers

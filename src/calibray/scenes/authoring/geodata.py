@@ -1,6 +1,6 @@
 """Read vector files and height models with a fixed list of drivers.
 
-GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG). It chooses
+GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG). GDAL chooses
 the driver by the content of the file. This module opens only formats without references to other files. A file is
 recognized by its first bytes, and the sizes that it declares are checked before the data are read.
 """
@@ -34,17 +34,17 @@ VECTOR_FORMATS: Final = "GeoJSON, a Shapefile, a GeoPackage, a FlatGeobuf file o
 """Supported formats of vector files, as named in messages."""
 
 MOST_CELLS: Final = 25_000_000
-"""Largest number of cells that are read from a height model; filling gaps needs about 40 bytes per cell."""
+"""Maximum number of cells that are read from a height model; filling gaps needs about 40 bytes per cell."""
 
 LARGEST_BLOCK: Final = 2**28
-"""Largest block of a raster [bytes]; GDAL decompresses whole blocks."""
+"""Maximum size of a raster block [bytes]; GDAL decompresses whole blocks."""
 
 TEXT_GROWTH: Final = 15
 """Memory needed to parse GeoJSON or DXF, as a multiple of the file size [1]."""
 
 HEIGHTS: Final = (-500.0, 9000.0)
 """Range of heights on land [m]; values outside this range, such as -999, usually mark gaps that the file does not
-declare as such. The shore of the Dead Sea is at about -440 m, and the top of Mount Everest at 8849 m."""
+declare as nodata. The shore of the Dead Sea is at about -440 m, and the top of Mount Everest at 8849 m."""
 
 _MAGIC: Final = (
     (b"SQLite format 3\0", "GPKG"),
@@ -54,7 +54,7 @@ _MAGIC: Final = (
 
 _LOG: Final = logging.getLogger(__name__)
 _DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
-"""Start of a DXF file, without `<` and `{`, which mark the formats of other drivers."""
+"""Start of a DXF file; it must not contain `<` or `{`, which occur in the formats of other drivers."""
 
 _INSUNITS: Final = {1: 0.0254, 2: 0.3048, 4: 0.001, 5: 0.01, 6: 1.0, 14: 0.1}
 """DXF units of length [m]: inches, feet, millimetres, centimetres, metres, decimetres."""
@@ -90,7 +90,7 @@ def read_features(path: Path, layer: str | None) -> Features:
     """Read the features of a vector file in one of the `VECTOR_FORMATS`, or of one of its layers.
 
     Raises:
-        InputError: The file does not exist, has another format, is damaged, or does not fit into memory.
+        InputError: The file does not exist, has an unsupported format, is damaged, or does not fit into memory.
     """
     # A geodatabase is a folder.
     if not (path.is_dir() or exists(path)):
@@ -142,7 +142,7 @@ def _check_text_size(path: Path, what: str) -> None:
 
 def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
     pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
-    # In an absolute path, GDAL interprets no part of the name as a prefix, such as /vsicurl or WFS:.
+    # GDAL does not interpret any part of an absolute path as a prefix, such as /vsicurl or WFS:.
     file = str(path.resolve())
     # DXF blocks can be nested, and nested blocks can expand from a few kilobytes to gigabytes.
     pyogrio.set_gdal_config_options({"DXF_INLINE_BLOCKS": False})
@@ -158,7 +158,7 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
         count = int(info["features"])
         if info["driver"] != driver:
             raise InputError(f"{path}: is damaged; give {VECTOR_FORMATS}")
-        # A feature with its outline and attributes needs at least 500 bytes.
+        # A feature, including its outline and attributes, needs at least 500 bytes of memory.
         if count * 500 > available_memory():
             raise InputError(
                 f"{path}: declares {count:,} features, more than fit into memory; cut out the area that you need"
@@ -241,15 +241,15 @@ class HeightModel:
         """Read heights [rows, columns], [m], from the first to the last row and column, inclusive; gaps are masked.
 
         Raises:
-            InputError: There are too many heights, they cannot be read, or a value is less than `lowest` [m] or greater
-                than any height on land.
+            InputError: There are too many heights, the heights cannot be read, or a value is less than `lowest` [m] or
+                greater than any height on land.
         """
         rasterio = library("rasterio", "scenes")
         rows, columns = (last - first + 1).tolist()
         if rows * columns > MOST_CELLS:
             raise InputError(
-                f"height model {self.path}: {rows * columns:,} cells are in the scene, more than {MOST_CELLS:,}; give "
-                "a coarser model, or lower the margin"
+                f"height model {self.path}: {rows * columns:,} cells are in the scene, but at most "
+                f"{MOST_CELLS:,} are supported; give a coarser model, or reduce the margin"
             )
         window = rasterio.windows.Window(first[1], first[0], columns, rows)
         try:
@@ -265,24 +265,24 @@ class HeightModel:
             value = stored[np.ma.filled(wrong, False)][0]
             below = f"below {lowest:g} m or " if np.isfinite(lowest) else ""
             raise InputError(
-                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells have values {below}above "
-                f"{HEIGHTS[1]:g} m, which are not heights on land, such as {value:g}; "
+                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} values are {below}above "
+                f"{HEIGHTS[1]:g} m and therefore not heights on land, such as {value:g}; "
                 f"declare this value as nodata (gdal_edit.py -a_nodata {value:g}), or correct the unit"
             )
         return heights
 
     def stored(self, height: float) -> float:
-        """The number that the file stores for a height [m]."""
+        """The number that represents a height [m] in the file."""
         return (height / self.metres - self.dataset.offsets[0]) / self.dataset.scales[0]
 
 
 @contextmanager
 def open_height_model(path: Path) -> Iterator[HeightModel]:
-    """Open a height model, a GeoTIFF.
+    """Open a height model, which must be a GeoTIFF.
 
     Raises:
-        InputError: The file does not exist or is not a GeoTIFF; its coordinate reference system or unit is unknown; it
-            has no regular grid; or a file next to it changes its heights.
+        InputError: The file does not exist or is not a GeoTIFF, its coordinate reference system or unit is unknown, its
+            grid is not regular, or a file next to it changes its heights.
     """
     rasterio = library("rasterio", "scenes")
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""Making scenes: materials, scene files with a record of assumptions, and scenes from footprints.
+"""Makes scenes from footprints, and defines their materials and the record of assumptions in their files.
 
 By default, roofs and walls have separate materials. Sionna RT finds wedges only within one mesh, so eaves diffract only
 if roofs and walls share a material (`Palette(roof=None)`). The vertical edges of walls always diffract.
@@ -44,7 +44,7 @@ SCENE_FILES: Final = ("scene.xml", "scene.json")
 """Files written next to the folder of meshes."""
 
 THICKEST: Final = 100.0
-"""Largest thickness of a material in a new scene [m]."""
+"""Maximum thickness of a material in a new scene [m]."""
 
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
@@ -59,8 +59,8 @@ class SurfaceMaterial:
         thickness: Thickness of the slab [m].
 
     Raises:
-        InputError: The name is an ITU name or contains characters other than letters, digits, `_` and `-`; there is no
-            such ITU material; or the thickness is not positive or exceeds `THICKEST`.
+        InputError: The name is an ITU name or contains characters other than letters, digits, `_` and `-`. The ITU
+            material does not exist. The thickness is not positive or exceeds `THICKEST`.
     """
 
     name: str
@@ -112,7 +112,8 @@ class Palette:
     Attributes:
         wall: Material of walls.
         window: Material of windows.
-        roof: Material of roofs and undersides. If None, they have the material of the walls, so eaves diffract.
+        roof: Material of roofs and undersides. If None, roofs and undersides have the material of the walls, so eaves
+            diffract.
         ground: Material of the ground.
     """
 
@@ -132,7 +133,7 @@ class MadeScene:
         bounds: West, south, bottom, east, north and top [6], [m].
         triangles: Number of triangles by material.
         counts: Number of objects that were used, repaired or left out, by kind.
-        guessed: Names of the buildings whose height is assumed, by the source of the assumption.
+        guessed: Names of the buildings with an assumed height, grouped by the source of the assumption.
         walls: Sentences that state how the lines of a floor plan were used.
     """
 
@@ -157,7 +158,7 @@ class MadeScene:
 
 
 def extent(objects: Sequence[MeshObject]) -> tuple[tuple[float, ...], dict[str, int]]:
-    """Bounds of objects, in the order of `MadeScene.bounds`, and their number of triangles by material."""
+    """Bounds of objects, in the order of `MadeScene.bounds`, and the number of triangles of each material."""
     triangles = dict.fromkeys(sorted({item.material for item in objects}), 0)
     for item in objects:
         triangles[item.material] += len(item.mesh.faces)
@@ -176,8 +177,8 @@ def write_made_scene(
     Unused and repeated materials are ignored.
 
     Raises:
-        InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be
-            replaced.
+        InputError: Two different materials have the same name, a material and a mesh have the same name, or a file must
+            not be replaced.
     """
     constants: dict[str, Mapping[str, float | str]] = {}
     for material in materials:
@@ -229,8 +230,8 @@ def make_scene(
             material. A study can then assign separate materials to individual buildings. Tracing many meshes takes
             longer.
         overwrite: Whether to replace files that Calibray did not write.
-        trees: Trees. If `frame` is given, those within `margin` of the buildings are written to `TREES_FILE` next to
-            the scene.
+        trees: Trees. If `frame` is given, the trees within `margin` of the buildings are written to `TREES_FILE` next
+            to the scene.
 
     Raises:
         InputError: There is no building, the margin is out of range, the folder cannot be written to, or a file in it

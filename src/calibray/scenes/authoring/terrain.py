@@ -18,18 +18,19 @@ from calibray.scenes.authoring.geodata import HeightModel, open_height_model
 from calibray.scenes.meshes import Mesh
 
 MAX_POINTS: Final = 4_000_000
-"""Largest number of points in a ground sheet; it limits memory use."""
+"""Maximum number of points in a ground sheet, to limit memory use."""
 
 STEP: Final = 200.0
-"""Difference in height from all neighbouring cells from which a cell is suspicious [m]. The number -999 in feet, which
-marks gaps in some models, is a height of -304 m. Buildings and masts in surface models are rarely taller than this."""
+"""A cell is suspicious if its height differs from those of all neighbouring cells by at least this amount [m]. The
+number -999 in feet, which marks gaps in some models, is a height of -304 m. Buildings and masts in surface models are
+rarely taller than this."""
 
 _LOG: Final = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights of the ground on a grid; each cell is divided into two triangles from south-west to north-east.
+    """Heights of the ground on a grid; a diagonal from south-west to north-east divides each cell into two triangles.
 
     Attributes:
         x: Eastings of the grid, ascending [nx], [m].
@@ -97,8 +98,8 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
         example on water, the height of the nearest cell with a height is used. Cells without a height are counted.
 
     Raises:
-        InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the bounds
-            or has no heights within them, or the grid would be too fine.
+        InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the
+            bounds, or has no heights within the bounds. The grid would be too fine.
     """
     path = Path(path)
     west, south, east, north = np.asarray(bounds, dtype=float)
@@ -112,7 +113,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
             centre = frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2]
             raise InputError(
                 f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
-                f"around {centre.round(5).tolist()}; give a larger model, or lower the margin"
+                f"around {centre.round(5).tolist()}; give a larger model, or reduce the margin"
             )
         # Interpolation needs one additional cell on each side.
         first = np.maximum(np.floor([row.min() - 1, column.min() - 1]).astype(int), 0)
@@ -129,7 +130,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     if columns * rows > MAX_POINTS:
         raise InputError(
             f"spacing = {spacing:g} m: gives {columns * rows} points of ground, more than {MAX_POINTS}; "
-            "give a wider spacing"
+            "give a larger spacing"
         )
     x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
     grid_x, grid_y = np.meshgrid(x, y)
@@ -171,8 +172,8 @@ def _warn_of_steps(model: HeightModel, heights: np.ma.MaskedArray, first: NDArra
             place = transformer(model.crs, WGS84).transform(*model.dataset.xy(row, column))
             stored = model.stored(float(extreme))
             _LOG.warning(
-                "height model %s: %d of %d cells have the height %.4g m, which differs by at least %.4g m from all "
-                "cells around them; the first is at longitude %.5f, latitude %.5f; if they are gaps, declare them as "
+                "height model %s: the height in %d of %d cells is %.4g m, which differs by at least %.4g m from all "
+                "surrounding cells, first at longitude %.5f, latitude %.5f; if this value marks gaps, declare it as "
                 "nodata (gdal_edit.py -a_nodata %g)",
                 model.path, cells.sum(), cells.size, extreme, step, *place, stored,
             )  # fmt: skip
@@ -187,4 +188,4 @@ def _fill(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], 
     if not missing.any():
         return values, {}
     nearest = np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))
-    return values[tuple(nearest)], {"heights missing, taken from the nearest": int(missing.sum())}
+    return values[tuple(nearest)], {"missing heights, filled from the nearest cell": int(missing.sum())}

@@ -43,7 +43,7 @@ CLEARANCE: Final = 2.5
 the ground."""
 
 TALLEST: Final = 120.0
-"""Largest height of a tree [m]; the world's tallest tree is 116 m high."""
+"""Maximum height of a tree [m]; the world's tallest tree is 116 m high."""
 
 WIDEST_CROWN: Final = 60.0
 """Largest diameter of a crown [m]."""
@@ -164,7 +164,7 @@ def _stated(tags: Mapping[str, str], key: str, largest: float) -> float | None:
 
 
 LEAST: Final = 2.0
-"""Smallest height of vegetation that counts as trees [m], as in canopy models from laser scans."""
+"""Minimum height of vegetation that counts as trees [m], as in canopy models from laser scans."""
 
 STEP: Final = 1.0
 """Step to which canopy heights are rounded [m], so adjacent cells of equal height form one polygon; canopy models have
@@ -199,7 +199,7 @@ def read_canopy(
         size = np.array([dataset.height, dataset.width])
         first = np.clip(np.floor([row.min(), column.min()]).astype(int), 0, size - 1)
         last = np.clip(np.ceil([row.max(), column.max()]).astype(int), 0, size - 1)
-        # A negative value marks a cell without a tree, whatever its size.
+        # Any negative value marks a cell without trees.
         heights = np.maximum(model.read(first, last, lowest=-np.inf).filled(0.0), 0.0)
         crs = model.crs
     classes = np.round(heights / STEP).astype(np.int32)

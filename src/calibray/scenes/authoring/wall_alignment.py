@@ -19,16 +19,16 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 TOLERANCE: Final = 25.0
-"""Largest deviation from a straight line that rounding can cause in collinear walls a few metres long [mm]."""
+"""Maximum deviation from a straight line that rounding can cause in collinear walls a few metres long [mm]."""
 
 REACH: Final = 30_000.0
-"""Largest gap between two collinear walls, such as the width of a street [mm]."""
+"""Maximum gap between two collinear walls, such as the width of a street [mm]."""
 
 TURN: Final = 0.05
-"""Sine of the largest angle between two collinear walls; rounding can rotate short walls by this angle."""
+"""Sine of the maximum angle between two collinear walls; rounding can rotate short walls by this angle."""
 
 CROSSING: Final = 0.2
-"""Sine of the smallest angle at which the crossing of two lines defines a corner."""
+"""Sine of the minimum angle at which the crossing of two lines defines a corner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,8 @@ class Alignment:
 def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignment:
     """Align collinear walls among vertical and level triangles [F, 3, 3], [mm].
 
-    Corners within `tolerance` [mm] of a straight line are moved onto this line, unless that would reverse an edge or a
-    level triangle.
+    Corners within `tolerance` [mm] of a straight line are moved onto this line, unless the move would reverse an edge
+    or a level triangle.
     """
     points, index = np.unique(triangles[..., :2].reshape(-1, 2), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
@@ -151,10 +151,11 @@ def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArra
 
 
 def _group(segments: NDArray[np.float64], pairs: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Index of the line that each segment shares with others; -1 if it shares none [S]."""
+    """Index of the line that each segment shares with other segments; -1 if there is no such line [S]."""
     line = np.full(len(segments), -1)
     closeness, count = tolerance, 0
-    # Short segments of an arc can form a chain that no line fits; they are grouped again with a smaller distance.
+    # Short segments of an arc can form a chain that no line fits; these segments are grouped again with a smaller
+    # distance.
     while len(pairs) and closeness > 1:
         pairs = pairs[_continues(segments, pairs, closeness)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(segments), len(segments)))

@@ -18,7 +18,7 @@ from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
 from calibray.support.lazy_imports import library
 
 THICKEST: Final = 0.6
-"""Largest thickness of a wall whose faces are merged [m]."""
+"""Maximum thickness of a wall whose faces are merged [m]."""
 
 _PARALLEL: Final = np.cos(np.radians(2.0))
 _TOUCHING: Final = 0.02  # distance below which ends meet [m]
@@ -43,12 +43,13 @@ class MergedPlan:
 def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     """Merge the two faces of each wall into one sheet.
 
-    Two lines are faces of one wall if they are parallel and have the same type, bottom and top. They must also overlap
-    over a length that exceeds both their distance and half of the shorter line. Neither line may have a closer opposite
-    face. Their distance is at most `THICKEST`. It differs from a given thickness by at most a fifth of that thickness,
-    or 2 cm if that is more. Where one long face is opposite several short faces, as between a corridor and its rooms,
-    each pair becomes a sheet. Gaps of up to `THICKEST` between these sheets are closed. Sheets end midway between the
-    faces' ends, so that corners meet.
+    Two lines are faces of one wall if they are parallel and have the same type, bottom and top. The lines must also
+    overlap over a length that exceeds both the distance between them and half of the shorter line. Neither line may
+    have a closer opposite face. The distance between the lines is at most `THICKEST`. If the thickness of the wall is
+    given, the distance differs from the thickness by at most a fifth of the thickness or 2 cm, whichever is greater.
+    Where one long face is opposite several short faces, as between a corridor and its rooms, each pair becomes a sheet.
+    Gaps of up to `THICKEST` between these sheets are closed. Sheets end midway between the faces' ends, so that corners
+    meet.
 
     Where one face is longer than the opposite face, the remaining part is kept as a sheet in the same plane. The short
     lines that close the outline of a wall are left out. If the walls of a type have no given thickness, their thickness
@@ -209,7 +210,7 @@ def _closes_wall(segment: Segment, pairs: Sequence[tuple[int, int]], segments: S
 
 
 def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
-    """Join sheets of one wall that only a crossing wall separates."""
+    """Join sheets of one wall that are separated only by a crossing wall."""
     joined: list[Segment] = []
     for sheet in sorted(sheets, key=lambda sheet: min(sheet.start, sheet.end)):
         for index, before in enumerate(joined):

@@ -19,7 +19,7 @@ from calibray.scenes.triangles import BATCH, STEEP, Triangles, is_ground, vertic
 from calibray.support.lazy_imports import library
 
 KERB: Final = 2.0
-"""Height above the lowest point of a scene up to which objects, such as kerbs, do not count as buildings [m]."""
+"""Objects up to this height above the lowest point of a scene, such as kerbs, do not count as buildings [m]."""
 
 CLEARANCE: Final = 0.05
 """A surface is above an antenna if it is higher by more than this distance [m]."""
@@ -163,7 +163,8 @@ class SceneSurfaces:
     def _surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """All surfaces at the given positions: index of the position, and height of the surface [m]."""
         shapely = library("shapely", "scenes")
-        # A point on an edge belongs to both faces; callers compare counts with zero or each other, not with one.
+        # A point on an edge belongs to both faces, so callers compare the counts with zero or with each other, not with
+        # one.
         index, face = self._tree.query(shapely.points(position[:, :2]), predicate="intersects")
         a, b, c = np.moveaxis(self.level[face], 1, 0)
         normal = np.cross(b - a, c - a)
@@ -193,7 +194,7 @@ def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLi
 
 
 def building_outlines(source: str | Path) -> Any:
-    """The area that buildings and other bodies of a scene cover in plan, as a shapely geometry [m]; may be empty.
+    """The area that buildings and other bodies of a scene cover in plan, as a shapely geometry [m], which may be empty.
 
     Faces less than `KERB` above the scene's lowest point, such as kerbs, floors and the ground, are ignored.
 
@@ -219,8 +220,8 @@ def move_outside(
         points: Positions [n, 3], [m]; heights do not change.
         outlines: The area that buildings cover, from `building_outlines`.
         clearance: Distance of a moved position from the wall [m].
-        furthest: Largest distance by which a position is moved [m]; positions that would have to move farther become
-            NaN.
+        furthest: Maximum distance by which a position is moved [m]; positions that would have to be moved farther
+            become NaN.
 
     Returns:
         The positions [n, 3], [m], NaN where the distance exceeds `furthest`; and the distance moved [n], [m].
@@ -239,7 +240,7 @@ def move_outside(
     if not clearance > 0:
         raise InputError(f"clearance = {clearance!r}: must be greater than 0 m")
     if not np.isfinite(moved).all():
-        raise InputError("positions must be finite numbers, in metres; correct or remove the others")
+        raise InputError("positions must be finite numbers, in metres; correct or remove the other positions")
     inside = np.flatnonzero(shapely.contains_xy(outlines, moved[:, 0], moved[:, 1]))
     distance = np.zeros(len(moved))
     if not len(inside):
@@ -255,7 +256,7 @@ def move_outside(
 
 
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
-    """The location of each point [n, 3], [m]: `BEYOND`, `UNDER`, `INSIDE`, or empty in the open.
+    """The location of each point [n, 3], [m]: `BEYOND`, `UNDER`, `INSIDE`, or an empty string for a point in the open.
 
     A point is inside a building if an upward vertical ray crosses an odd number of surfaces, as it does inside any
     closed body. The ground consists of the triangles marked in `Triangles.ground`.

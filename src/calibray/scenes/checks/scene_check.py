@@ -19,6 +19,7 @@ from calibray.scenes.scene import ITU_NAMES
 from calibray.scenes.scene_file import find_scene
 from calibray.scenes.shapes import COARSE, TOO_COARSE, read_surface
 from calibray.scenes.triangles import read_meshes, vertical_crossings
+from calibray.support.messages import counted
 from calibray.support.progress import Progress
 
 Severity = Literal["error", "warning", "note"]
@@ -26,9 +27,9 @@ Severity = Literal["error", "warning", "note"]
 _FLAT: Final = 1e-10  # area below which a face counts as empty [m^2]
 
 CLOSE: Final = 0.01
-"""Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, it reflected twice from sheets 1
-mm apart and found no path through walls 0.1 to 5 mm apart. A gap of 10 mm was enough. At 900 m, a gap of 100 mm was
-necessary."""
+"""Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, Sionna RT found two reflections
+from sheets 1 mm apart and no path through walls 0.1 to 5 mm apart. A gap of 10 mm was enough. At 900 m from the origin,
+a gap of 100 mm was necessary."""
 
 _PARALLEL: Final = 0.999  # smallest cosine of the angle between the normals of parallel faces
 
@@ -135,44 +136,44 @@ def check_scene(source: str | Path, progress: Progress | None = None) -> SceneCh
 
 
 def _mesh_findings(item: MeshFaults) -> list[Finding]:
-    share = f"of {item.faces} faces"
     faults: Sequence[tuple[int, Severity, str, str]] = (
         (
             item.unwelded_edges,
             "warning",
-            "edges at which faces meet without sharing vertices: no diffraction there",
+            f"{counted(item.unwelded_edges, 'edge')} at which faces meet without sharing vertices, where Sionna RT "
+            "finds no diffraction",
             "merge vertices by distance (Blender: M, By Distance) and export again without splitting normals",
         ),
         (
             item.crowded_edges,
             "note",
-            "edges shared by more than two faces: no diffraction there",
+            f"{counted(item.crowded_edges, 'edge')} shared by more than two faces, where Sionna RT finds no "
+            "diffraction",
             "remove inner walls, or separate bodies that touch",
         ),
         (
             item.flipped_faces,
             "note",
-            f"{share} with normals that point inward or opposite to those of their neighbours; Sionna RT accepts this, "
-            f"but other programs may not",
+            f"{item.flipped_faces} of {item.faces} faces with normals that point inward or opposite to the normals of "
+            "adjacent faces; Sionna RT accepts such normals, but other programs may not",
             "recalculate normals to point outside (Blender: Shift-N)",
         ),
         (
             item.empty_faces,
             "warning",
-            f"{share} with zero area",
+            f"{item.empty_faces} of {item.faces} faces with zero area",
             "dissolve degenerate faces, and export again",
         ),
         (
             item.repeated_faces,
             "warning",
-            f"{share} that duplicate another face: paths through them may be lost, and reflections counted twice",
+            f"{item.repeated_faces} of {item.faces} faces coincide with another face: paths through these faces may be "
+            "lost, and reflections may be counted twice",
             "remove the duplicates",
         ),
     )
     return [
-        Finding(severity, item.name, f"{count} {problem}", remedy)
-        for count, severity, problem, remedy in faults
-        if count
+        Finding(severity, item.name, problem, remedy) for count, severity, problem, remedy in faults if count
     ]
 
 
@@ -220,7 +221,7 @@ def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Itera
 
 
 def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding]:
-    """Report exposed faces that nearly coincide with a parallel face, with one such pair of objects as an example."""
+    """Report exposed faces that nearly coincide with a parallel face, and name one pair of objects as an example."""
     shapes = root.findall("shape")
     meshes = [read_surface(shape, path) for shape in shapes]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
@@ -235,25 +236,24 @@ def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding
     differs = np.array([names[one] != names[other] for one, other in pairs.tolist()])
     one, other = (shapes[number].get("id") for number in pairs[np.argmax(differs)].tolist())
     material = (
-        f", {differs.sum()} of them to a face of a different material, and a ray may hit either face"
+        f", {differs.sum()} of them to a face of a different material, so a ray may hit either face"
         if differs.any()
         else ""
     )
     problem = (
-        f"{len(covered)} faces are closer than {CLOSE:g} m to a parallel face (such as faces of {one!r} and {other!r})"
-        f"{material}"
-        ": reflections may count twice, and paths through the faces may be lost"
+        f"{counted(len(covered), 'face')} closer than {CLOSE:g} m to a parallel face (such as faces of {one!r} and "
+        f"{other!r}){material}: reflections may be counted twice, and paths through the faces may be lost"
     )
     severity: Severity = "warning" if differs.any() else "note"
     yield Finding(severity, "", problem, "remove one of the faces, or move them apart by 0.1 m")
 
 
 def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each face, the index of a parallel face that is closer than `CLOSE` to its centroid [F]; -1 if none.
+    """Index of a parallel face that is closer than `CLOSE` to the centroid of each face [F]; -1 if there is none.
 
-    Faces are [F, 3, 3], [m]. Faces that rays cannot reach from outside get -1: walls between touching buildings, and
-    floors of buildings on the ground. A side of a face is in the open if a straight line from it crosses an even
-    number of faces.
+    Faces are [F, 3, 3], [m]. The index is also -1 for faces that rays cannot reach from outside: walls between touching
+    buildings, and floors of buildings on the ground. A side of a face is in the open if a straight line from it crosses
+    an even number of faces.
     """
     cover = np.full(len(corners), -1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -303,7 +303,7 @@ def count_faults(item: MeshObject) -> MeshFaults:
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
         open_edges=open_edges,
-        # An unwelded edge is open twice, once for each face.
+        # An unwelded edge counts as two open edges, one for each face.
         unwelded_edges=max(0, (int((uses == 1).sum()) - open_edges) // 2),
         crowded_edges=int((uses_by_position > 2).sum()),
         flipped_faces=_count_flipped(mesh.vertices, mesh.faces[~empty], by_position[~empty]),
@@ -325,7 +325,7 @@ def _count_flipped(
     """Count the faces with wrong normals.
 
     The faces of each connected piece are first given a consistent orientation. The correct orientation is known for two
-    kinds of piece. The signed volume of a piece that is closed, or open only at its bottom, must be positive. The
+    kinds of pieces. The signed volume of a piece that is closed, or open only at its bottom, must be positive. The
     normal of a horizontal sheet must point up. For any other piece, such as a wall, either side may be outside, and the
     faces that differ from the majority are counted.
     """
@@ -369,15 +369,15 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sign, +1 or -1, that gives each face the orientation of its neighbours [F]; and its connected piece [F]."""
+    """Sign [F], +1 or -1, that gives each face the orientation of its neighbours, and index of its piece [F]."""
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")
     pairs = order[uses[edge[order]] == 2].reshape(-1, 2)
     one, other = pairs.T // 3
     same = (sides[pairs[:, 0]] == sides[pairs[:, 1]][:, ::-1]).all(axis=1)
-    # The graph has two nodes for each face: f is the face as given, and count + f is the face reversed. Its edges join
-    # orientations of neighbours that agree, so all nodes of one component agree.
+    # The graph has two nodes for each face: f is the face as given, and count + f is the face reversed. The edges of
+    # the graph join consistent orientations of neighbours, so all orientations in one component are consistent.
     links = np.concatenate(
         [
             np.column_stack([one, np.where(same, other, other + count)]),

@@ -1,12 +1,12 @@
 """Rays are added in rounds until path loss converges (`trace.samples = "auto"`).
 
-Each round launches as many rays as all earlier rounds together, in other directions. The interaction sequences that the
-rays find depend only on the source; new sequences are tried for every receiver by the method of images
+Each round launches as many rays as all earlier rounds together, but in different directions. The interaction sequences
+that the rays find depend only on the source; new sequences are tried for every receiver by the method of images
 (`image_method`). The search ends after two successive rounds in which no link's path loss changes by more than
 `CONVERGED_DB`. The last round is equivalent to a second trace with twice as many rays (`calibray.tracing.convergence`).
 """
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.errors import EngineError
 from calibray.materials import Material
+from calibray.support.messages import counted
 from calibray.support.progress import Progress
 from calibray.tracing.settings import RAYS_PER_ROUND, TraceSettings
 from calibray.tracing.sionna.buffers import TracedBuffer, aligned, drop_repeats, reverse, to_points
@@ -38,13 +39,13 @@ from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
 
 CONVERGED_DB: Final = 0.05
-"""Largest change in a link's path loss in a round with which the link still counts as converged [dB]."""
+"""Maximum change in a link's path loss in one round at which the link counts as converged [dB]."""
 QUIET_ROUNDS: Final = 2
 """The search ends after this many consecutive rounds without a change above `CONVERGED_DB`."""
 MAX_LAUNCHES: Final = 256
-"""Largest number of launches per source: 64 million rays."""
+"""Maximum number of launches per source: 64 million rays."""
 GEOMETRY_BATCH: Final = 500_000
-"""Largest number of pairs of sequence and receiver whose geometry is computed together, to limit memory use."""
+"""Maximum number of sequence-receiver pairs whose geometry is computed together, to limit memory use."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -87,7 +88,7 @@ class SourceSequences:
         self._new_by_launch: list[PathsBuffer | None] = []
 
     def new_in_launch(self, number: int, max_paths: int) -> PathsBuffer | None:
-        """The sequences that launch `number` is the first to find, or None; the launch is run if needed."""
+        """The sequences first found in launch `number`, or None if there are none; the launch is run if needed."""
         while len(self._new_by_launch) <= number:
             sequences = self._launch(len(self._new_by_launch), max_paths)
             self._keys, new = _merge(self._keys, sequence_keys(sequences, self.meshes))
@@ -138,7 +139,7 @@ class AdaptiveSearch:
     ) -> tuple[tuple[TracedBuffer, ...], dict[str, object]]:
         """Find the paths from the source of every launch to the other ends of the links [L, 3], [m].
 
-        Returns the paths, the largest number of rays of a source, and the largest change of a link in the last round.
+        Returns the paths, the maximum number of rays per source, and the maximum change of any link in the last round.
         `progress` is called before the first source and after each source.
 
         Raises:
@@ -191,7 +192,7 @@ class _SourceSearch:
         launches, quiet = 0, 0
         while quiet < QUIET_ROUNDS and launches < MAX_LAUNCHES:
             parts: list[TracedBuffer] = []
-            # As many launches as in all previous rounds.
+            # Each round has as many launches as all previous rounds together.
             for _ in range(max(launches, 1)):
                 sequences = self._sequences.new_in_launch(launches, self._max_paths)
                 launches += 1
@@ -204,7 +205,7 @@ class _SourceSearch:
             self.rays, self.change_db = launches * RAYS_PER_ROUND, float(change_db.max())
             power += gained
             quiet = quiet + 1 if self.change_db <= CONVERGED_DB else 0
-        # The launch limit may also be reached after one quiet round; then no warning is needed.
+        # The launch limit may also be reached after one quiet round; in this case, no warning is needed.
         if quiet < QUIET_ROUNDS and self.change_db > CONVERGED_DB:
             x, y, z = self._launch.source.tolist()
             _LOG.warning(
@@ -215,7 +216,7 @@ class _SourceSearch:
             )  # fmt: skip
 
     def _direct_paths(self) -> TracedBuffer:
-        """Find the paths without an interaction."""
+        """Find the paths without interactions."""
         source, target = to_points(self._launch.source[None]), to_points(self._targets)
         rays = Rays(
             count=0,
@@ -264,7 +265,7 @@ class _SourceSearch:
         self.traced += new
         if sum(len(part.link) for part in self.traced) > self._max_paths:
             raise EngineError(
-                f"more paths than fit into memory, with {len(self._targets)} receivers at once; lower "
+                f"more paths than fit into memory, with {counted(len(self._targets), 'receiver')} at once; reduce "
                 "trace.max_depth, or trace fewer links at once"
             )
         gained = np.zeros(len(self._targets))
@@ -272,7 +273,7 @@ class _SourceSearch:
         order = np.argsort(self._launch.links)
         for part in new:
             gain = self._solver.compute_fields(part)
-            # Summed over receive ports, averaged over transmit ports.
+            # The power is summed over receive ports and averaged over transmit ports.
             power = (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
             target = order[np.searchsorted(self._launch.links[order], part.link)]
             gained += np.bincount(target, power, len(self._targets))

@@ -14,7 +14,7 @@ from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from calibray.paths import Kind
 from calibray.tracing.trace_plan import find_repeats
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
 
 
@@ -22,7 +22,7 @@ def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
     """Copy numbers [n], converted to a data type, to memory aligned to 64 bytes.
 
     Dr.Jit uses NumPy's memory without copying it and compiles a separate kernel for each alignment. With random
-    alignment, its kernel cache rarely hits, and every process spends seconds on compilation.
+    alignment, the kernel cache of Dr.Jit rarely hits, and every process spends seconds on compilation.
     """
     memory = np.empty(values.size * np.dtype(dtype).itemsize + 64, dtype=np.uint8)
     start = -memory.ctypes.data % 64
@@ -91,7 +91,7 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
     """Remove the entries that Sionna RT 2.2 counts but does not fill, which occur with refraction.
 
     An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each
-    empty entry into another direct path between the two.
+    empty entry into another direct path between these ends.
     """
     if not buffer.buffer_size:
         return buffer
@@ -101,7 +101,7 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
 
 
 def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
-    """Remove paths that several launches to the same receivers found; keep random samples of diffuse reflection.
+    """Remove repeated paths found by several launches to the same receivers; keep random samples of diffuse reflection.
 
     Buffers are in the order of the launches; paths that an earlier buffer contains are removed from later buffers.
     """
@@ -133,14 +133,14 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions.
     Candidates for one direction are therefore also candidates for the other. Candidates are reversed before their
-    geometry is computed, so that a path is identical to the last digit, whichever end sent the rays. Three properties
-    depend on the direction: the order of the interactions, the two ends, and the faces of an edge, because Sionna's
-    0-face is the illuminated face.
+    geometry is computed, so that a path is identical to the last digit, regardless of which end sent the rays. Three
+    properties depend on the direction: the order of the interactions, the two ends, and the faces of an edge, because
+    Sionna's 0-face is the illuminated face.
     """
     if not buffer.buffer_size:
         return buffer
     reversed_buffer = buffer.reverse()
-    # Sionna has no type annotations for the wedges; they are None without diffraction.
+    # Sionna has no type annotations for the wedges; without diffraction, the wedges are None.
     wedges: Any = reversed_buffer.diffracting_wedges
     if wedges is not None:
         start = to_numpy(sources)[np.array(reversed_buffer.source_indices, dtype=np.int64)]

@@ -12,7 +12,7 @@ sequence and receiver can be excluded immediately, because the line would cross 
 Sionna's own image method computes the paths of the remaining pairs.
 """
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from calibray.tracing.sionna.buffers import aligned, per_interaction, to_numpy
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
-"""Largest difference between the offsets of equal planes [m]; their normals differ by at most a fiftieth of this
+"""Maximum difference between the offsets of equal planes [m]; their normals differ by at most a fiftieth of this
 number."""
 CONFUSABLE_PLANE: Final = 0.05
-"""The same limit for planes that the tracer can confuse in single precision."""
+"""Maximum difference between the offsets of planes that the tracer can confuse in single precision [m]."""
 MARGIN: Final = 0.1
-"""Largest distance by which a valid point may lie outside a surface [m]; it allows for single precision and rounded
+"""Maximum distance by which a valid point may lie outside a surface [m], to allow for single precision and rounded
 corners.
 """
 NEAR_PLANE: Final = 0.01
 """Distance from a plane below which a point can be on either side of the plane [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
-"""Largest number of pairs of sequence and receiver that are tested together, to limit memory use."""
+"""Maximum number of sequence-receiver pairs that are tested together, to limit memory use."""
 
 
 class Surfaces:
@@ -57,7 +57,7 @@ class Surfaces:
         length = np.linalg.norm(cross, axis=1, keepdims=True)
         self.normal: NDArray[np.float64] = cross / np.where(length > 0, length, 1)
         self.offset: NDArray[np.float64] = np.einsum("ti,ti->t", self.normal, corner[:, 0])
-        # Offsets and normals on a common scale; planes are equal if they agree within `SAME_PLANE`.
+        # Offsets and normals are brought to a common scale; planes are equal if both agree within `SAME_PLANE`.
         feature = np.c_[50 * self.normal, self.offset]
         # Both sides of a surface are one plane: the first component of the normal that is not 0 is made positive.
         leading = np.argmax(np.abs(feature[:, :3]) > SAME_PLANE, axis=1)
@@ -202,8 +202,8 @@ class Meshes:
         for key, shape in shape_ids(scene).items():
             if not shape.is_mesh():
                 raise InputError(
-                    f"trace.samples = 'auto': the shape {shape.id()!r} is not made of triangles; give a number, or "
-                    "export the scene with meshes only"
+                    f"trace.samples = 'auto': the shape {shape.id()!r} is not made of triangles; give a number of "
+                    "rays, or export the scene with meshes only"
                 )
             values = mi.traverse(shape)
             vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
@@ -214,7 +214,7 @@ class Meshes:
         self.surfaces = Surfaces(np.concatenate(corners) if corners else np.zeros((0, 3, 3)))
 
     def triangles(self, shape: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Indices of triangles in the scene [...], from their shapes and their indices in these; 0 without a shape."""
+        """Indices of triangles in the scene [...], given shapes and indices within these shapes; 0 without a shape."""
         distinct, position = np.unique(shape, return_inverse=True)
         starts = np.array([self._first.get(key, -1) for key in distinct.tolist()], dtype=np.int64)
         first = starts[position.reshape(shape.shape)]
@@ -295,7 +295,8 @@ def possible_pairs(
             kind = dr.gather(mi.UInt, kinds, at)
             goal = dr.gather(mi.Point3f, aim, at) + dr.gather(mi.Point3f, slide, at) * mi.Point3f(along_edge)
             n, d = dr.gather(mi.Point3f, normal, at), dr.gather(mi.Float, offset, at)
-            # Signed distances of both points from the plane; their line crosses it between them if the signs differ.
+            # Signed distances of both points from the plane; the line crosses the plane between the points if the signs
+            # differ.
             near, far = dr.dot(n, vertex) - d, dr.dot(n, goal) - d
             crossing = vertex + (goal - vertex) * mi.Point3f(near / (near - far))
             inside = dr.all(crossing >= dr.gather(mi.Point3f, low, at)) & dr.all(

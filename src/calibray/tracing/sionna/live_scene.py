@@ -1,6 +1,6 @@
 """Reads scenes loaded in plain Sionna RT, sets their materials, and verifies exported scenes."""
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportIndexIssue=false
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class LiveScene:
         """Read a scene with its transmitters, receivers and arrays.
 
         Raises:
-            InputError: The object is not a scene of Sionna RT, or the scene has a property that a study cannot
+            InputError: The object is not a Sionna RT scene, or the scene has a property that a study cannot
                 describe.
         """
         live = _checked(scene)
@@ -103,12 +103,11 @@ class LiveScene:
 def apply_materials(scene: object, materials: Mapping[str, Material], frequency: float | None = None) -> None:
     """Set the constants of a scene's materials by name.
 
-    The constants are valid at one carrier, `frequency` [Hz]; a different carrier of the scene causes a warning.
-    After this call, setting `scene.frequency` does not replace the constants of ITU materials.
+    The constants are valid at one carrier frequency, `frequency` [Hz]; if the scene has a different carrier frequency,
+    a warning is given. After this call, setting `scene.frequency` does not replace the constants of ITU materials.
 
     Raises:
-        InputError: The object is not a scene of Sionna RT, or the scene lacks a material; in both cases, nothing is
-            set.
+        InputError: The object is not a Sionna RT scene, or the scene lacks a material; in both cases, nothing is set.
     """
     live = _checked(scene)
     for name in materials:
@@ -133,7 +132,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material], frequency:
 def _checked(scene: object) -> Any:
     if not isinstance(scene, rt.Scene):
         raise InputError(
-            f"scene is a {type(scene).__name__}; must be a scene of sionna.rt, as returned by load_scene"
+            f"scene is a {type(scene).__name__}; it must be a sionna.rt scene, as returned by load_scene"
         )
     return scene
 
@@ -195,7 +194,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
     if array.array_size != 1:
         raise InputError(
             f"scene.{end}_array has {array.array_size} elements; a measured value belongs to one antenna: set an array "
-            "of one element with its pattern"
+            "of one element with the pattern of this antenna"
         )
     if np.any(np.array(array.normalized_positions)):
         raise InputError(
@@ -221,7 +220,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
             return Antenna(pattern, polarization, (yaw, pitch, roll))
     raise InputError(
         f"scene.{end}_array has an unknown pattern; a study supports {', '.join(PATTERNS)} with polarization "
-        f"{', '.join(POLARIZATIONS)}: give its gain as a table (antennas.{end}.pattern) in a study file"
+        f"{', '.join(POLARIZATIONS)}; give the gain as a table (antennas.{end}.pattern) in a study file"
     )
 
 
@@ -243,7 +242,7 @@ def _vector(value: Any) -> NDArray[np.float64]:
 
 
 LARGEST_DIFFERENCE_DB: Final = 0.01
-"""Largest difference in path loss between traces that count as equal [dB]; the constants in the file are rounded."""
+"""Maximum difference in path loss between traces that count as equal [dB]; the constants in the file are rounded."""
 
 SAMPLES: Final = 20_000
 """Number of rays for the comparison; both scenes use the same rays."""
@@ -308,6 +307,6 @@ def verify_export(tracer: Tracer, materials: Mapping[str, Material], target: Pat
 
 def _failed(target: Path, fault: str) -> str:
     return (
-        f"{target}: was written, but is not the calibrated scene: {fault}; rename materials, objects and mesh files "
-        "with unusual characters, and export again"
+        f"{target}: was written, but differs from the calibrated scene: {fault}; rename materials, objects and mesh "
+        "files with unusual characters, and export again"
     )

@@ -1,6 +1,6 @@
 """Scenes, materials and antenna patterns in the form that Sionna RT requires."""
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _temporary_folder(path: Path) -> TemporaryDirectory[str]:
 
 def _load(xml: str, path: Path) -> rt.Scene:
     # Mitsuba looks for relative names in the working directory first, where another scene may have meshes of the same
-    # names. Absolute names ensure that it reads the files that the fingerprint of a trace covers.
+    # names. Absolute names ensure that Mitsuba reads the files that the fingerprint of a trace covers.
     root, folder = ElementTree.fromstring(xml), path.parent.resolve()
     for filename in root.iterfind(".//string[@name='filename']"):
         filename.set("value", str(folder / filename.get("value", "")))
@@ -94,7 +94,7 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
         traced = held.get(number, [])
         if not surfaces_agree(traced, stored, scene.local_origin):
             raise InputError(
-                f"{scene.path}: the surface of material {material!r} in Mitsuba differs from that of the mesh files "
+                f"{scene.path}: the surface of material {material!r} in Mitsuba differs from that in the mesh files "
                 f"({sum(size.area for size in traced):.6g} m^2 instead of {sum(size.area for size in stored):.6g} "
                 "m^2); export the meshes again, as binary PLY with coordinates of type float"
             )

@@ -1,10 +1,11 @@
 """Sionna RT's solver, stage by stage: candidate paths from rays, exact geometry from the method of images, and fields.
 
-The first two stages depend on the material constants only through the choice of a ray's next interaction. Their result
-is therefore kept and compiled into a path program. The field stage is the reference against which replay is tested.
+The first two stages depend on the material constants only through the choice of a ray's next interaction. The result of
+these stages is therefore kept and compiled into a path program. The field stage is the reference against which replay
+is tested.
 """
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from calibray.materials import SCALAR_CONSTANTS, Material, check_frequency
 from calibray.paths import Paths
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, check_material_name
+from calibray.support.messages import counted
 from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.protocol import Links, compile_paths
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -51,9 +53,9 @@ from calibray.tracing.trace_plan import SMALL_LAUNCH
 
 HASHES: Final = (16_777_213, 67_108_859)
 """Number of entries in Sionna's hash table for small and for large launches. Sionna drops candidates whose hashes
-collide. Of 31,430 candidates in a launch to 25 receivers, it drops 1,067 with its default of one million entries, 36
-with 16 million, and 4 with 67 million. A table of 67 million entries takes 0.5 GB and 0.3 s per launch. The numbers are
-primes, because the lowest bits of the hashes vary least."""
+collide. Of 31,430 candidates in a launch to 25 receivers, Sionna drops 1,067 with its default of one million entries,
+36 with 16 million, and 4 with 67 million. A table of 67 million entries takes 0.5 GB and 0.3 s per launch. The numbers
+are primes, because the lowest bits of the hashes vary least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +118,13 @@ class Solver:
         return other
 
     def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
-        """Set the constants of Sionna's materials, as given or else from the scene, and return all constants."""
+        """Set the constants of Sionna's materials, as given or otherwise from the scene, and return all constants."""
         for name in materials:
             check_material_name(name, self.scene.materials, "materials")
         constants = {**self.scene.materials, **materials}
         for index, material in enumerate(constants.values()):
             target = self._scene.radio_materials[f"calibray-{index}"]
-            # Opaque, because Dr.Jit would compile a literal into its kernels.
+            # The constants are opaque, because Dr.Jit would compile literals into its kernels.
             for constant in SCALAR_CONSTANTS:
                 setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
             target.scattering_pattern = scattering_pattern(material)
@@ -139,7 +141,7 @@ class Solver:
             EngineError: The candidates do not fit into memory.
         """
         settings, size = self.settings, rays.buffer_size
-        # At most one candidate per ray, interaction and target, plus the direct paths.
+        # There is at most one candidate per ray, interaction and target, plus the direct paths.
         most = (rays.count * settings.max_depth + 1) * dr.width(targets) + 2
         while True:
             with _ray_directions(rays.directions), _hash_table(HASHES[most > SMALL_LAUNCH]):
@@ -164,8 +166,8 @@ class Solver:
             if num_candidates > rays.max_paths:
                 num_receivers = len(np.unique(to_numpy(targets), axis=0))  # without the repeated receivers
                 raise EngineError(
-                    f"more paths than fit into memory, with {num_receivers} receivers at once; "
-                    "lower trace.samples or trace.max_depth, or trace fewer links at once"
+                    f"more paths than fit into memory, with {counted(num_receivers, 'receiver')} at once; "
+                    "reduce trace.samples or trace.max_depth, or trace fewer links at once"
                 )
             # The counter stops at the size of the buffer, so a full buffer may have lost candidates.
             if num_candidates < size - 1:
@@ -197,7 +199,8 @@ class Solver:
         buffer.valid &= (buffer.source_indices < limit) & (buffer.target_indices < limit)
         buffer.discard_invalid()
         buffer.schedule()
-        # Evaluated immediately: pending results would keep all candidates and the whole buffer in memory.
+        # The buffer is evaluated immediately, because pending results would keep all candidates and the whole buffer in
+        # memory.
         dr.eval()
 
     def compute_fields(self, traced: TracedBuffer) -> NDArray[np.complex128]:
@@ -219,9 +222,9 @@ class Solver:
             src_antenna_patterns=self._tx_functions,
             tgt_antenna_patterns=self._rx_functions,
         )
-        # Evaluated together: otherwise, reading each array would run the whole stage again.
+        # Both arrays are evaluated together; otherwise, reading each array would run the whole stage again.
         dr.eval(fields.a, fields.tau)
-        # The field stage may mark paths as invalid; the marks are restored, so that it can run again.
+        # The field stage may mark paths as invalid; the marks are restored, so that the stage can run again.
         buffer.valid = valid
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
@@ -248,7 +251,8 @@ class Solver:
             if self.settings.diffraction:
                 source = dr.gather(mi.Point3f, traced.source, buffer.source_indices)
                 target = dr.gather(mi.Point3f, traced.target, buffer.target_indices)
-                # Sionna's own lengths, so that replay reproduces their known error (docs/explanation/fidelity.md).
+                # Sionna's own lengths are used, so that replay reproduces their known error
+                # (docs/explanation/fidelity.md).
                 after, before = self._calculate_fields._diffraction_compute_s_s_prime(buffer, source, target)
                 wedges: Any = buffer.diffracting_wedges
                 lengths = np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1)

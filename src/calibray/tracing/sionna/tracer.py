@@ -5,7 +5,7 @@ All receivers of a source share Sionna's path buffer, whose memory grows with sa
 A launch that fills its buffer is repeated with a larger buffer.
 """
 
-# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from calibray.tracing.trace_plan import (
 )
 
 LANES: Final = 20_000_000
-"""Largest product of rays, interactions and receivers in one launch."""
+"""Maximum product of rays, interactions and receivers in one launch."""
 BUFFER: Final = 1_000_000
 """Initial capacity of the buffer of one launch [paths]."""
 
@@ -73,7 +73,8 @@ class Trace:
         ends = LinkPositions(self.tx - origin, self.rx - origin)
         paths = concatenate([self.solver.compile(part, ends, self.materials) for part in self.buffers])
         if origin.any():
-            # Double precision, because single precision would round vertices by up to half a metre.
+            # Positions and vertices are in double precision, because single precision would round vertices by up to
+            # half a metre.
             paths = replace(paths, tx_position=self.tx, rx_position=self.rx, vertex=paths.vertex + origin)
         return replace(paths, settings={**paths.settings, **self.record})
 
@@ -91,7 +92,7 @@ class Trace:
     def path_gains(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
         """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`.
 
-        `materials` replace constants of the trace by name.
+        `materials` override, by material name, the constants used for the trace.
         """
         self.solver.set_materials({**self.materials, **(materials or {})})
         return np.concatenate([self.solver.compute_fields(part) for part in self.buffers])[self._order()]
