@@ -312,9 +312,9 @@ def test_materials_replace_those_of_a_scene_already_read(house: Tracer) -> None:
         (
             [[0, 0, 9]],
             [[1, 0, 1], [2, 0, 1]],
-            r"links: tx has the shape \(1, 3\), rx \(2, 3\); .*\[links, 3\]",
+            r"links: tx has the shape \(1, 3\) and rx the shape \(2, 3\); .*\[links, 3\]",
         ),
-        ([[0, 0]], [[1, 0]], r"links: tx has the shape \(1, 2\), rx \(1, 2\); .*\[links, 3\]"),
+        ([[0, 0]], [[1, 0]], r"links: tx has the shape \(1, 2\) and rx the shape \(1, 2\); .*\[links, 3\]"),
         (np.zeros((0, 3)), np.zeros((0, 3)), r"links: .*at least one"),
     ],
 )

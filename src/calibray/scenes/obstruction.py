@@ -60,7 +60,7 @@ class Region:
             >>> belt.length_inside(start, end).tolist()
             [20.0, 0.0]
         """
-        # Over hills, each line is divided into steps, so lines are processed in batches.
+        # Over hilly ground, each line is divided into steps, so lines are processed in batches.
         parts = [self._lengths(start[k : k + LINES], end[k : k + LINES]) for k in range(0, len(start), LINES)]
         return np.concatenate([np.zeros(0), *parts])
 
@@ -183,7 +183,7 @@ class Obstruction:
     other_floor: NDArray[np.bool_]
 
     def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
-        """The columns `OBSTACLES` [n] by name, for one wavelength [m], or one wavelength for each link [n]."""
+        """The columns `OBSTACLES` [n] by name, for a common wavelength [m] or one wavelength per link [n]."""
         values = (self.out_of_sight, self.walls, self.length_m, self.knife_edge_db(wavelength))
         return {name: value.astype(np.float64) for name, value in zip(OBSTACLES, values, strict=True)}
 

@@ -1,9 +1,9 @@
 """Scenes: reading the materials and objects of a Mitsuba XML file, and rewriting the file for the tracer.
 
 In the scene for the tracer, each surface material is a plain Sionna `radio-material` with explicit constants and a name
-that Calibray chooses. This keeps the constants in one place (`Material`) and allows frequencies outside the range of an
-ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72). The new names also avoid conflicts with Sionna's
-naming rules: an ITU name needs the prefix `itu_`, and an object must not have the name of a material.
+that Calibray chooses. This approach keeps the constants in one place (`Material`) and allows frequencies outside the
+range of an ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72). The chosen names also avoid conflicts
+with Sionna's naming rules: an ITU name needs the prefix `itu_`, and an object must not have the name of a material.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def read_scene(
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene, or a mesh is missing or malformed. A material has
             no radio constants, or an override is for a material that is not in the scene. A pattern matches no object,
-            or objects with different materials. The frequency is outside the range of an ITU law.
+            or matches objects with different materials. The frequency is outside the range of an ITU law.
     """
     overrides, split = dict(overrides or {}), dict(split or {})
     path = scene_path(str(source))
@@ -154,7 +154,7 @@ def read_scene(
         if originals.setdefault(name, original) != original:
             raise InputError(
                 f"[objects] {name}: its objects have the materials {originals[name]!r} and {original!r}; "
-                "use a separate entry for each"
+                "use a separate entry for each material"
             )
         if name not in materials:
             constants = _merge(overrides.get(original), overrides.get(name) if name != original else None)
@@ -229,7 +229,8 @@ def _definitions(root: ElementTree.Element, path: Path) -> dict[str, ElementTree
             ElementTree.tostring(bsdf), strip_text=True
         ):
             raise InputError(
-                f"{path}: material {shortened(repr(name))} is defined twice, with different constants; rename one"
+                f"{path}: material {shortened(repr(name))} is defined twice, with different constants; "
+                "rename one of them"
             )
     return definitions
 
@@ -293,7 +294,7 @@ def _material(
     frequency: float,
     path: Path,
 ) -> tuple[Material, ItuLaw]:
-    """The constants of a material, from the override or else from the file, and their frequency law."""
+    """The constants of a material, from the override or otherwise from the file, and their frequency law."""
     if isinstance(override, Material):
         return override, frequency_independent_law(override)
     constants = {key: value for key, value in (override or {}).items() if value is not None}

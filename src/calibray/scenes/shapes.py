@@ -196,8 +196,8 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame in which a scene is traced.
 
     For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. A
-    scene counts as far from the origin if its largest coordinate exceeds both `FAR` and the scene's extent. The local
-    frame then gains at least one bit of precision. Otherwise the local origin is zero.
+    scene counts as far from the origin if its largest coordinate exceeds both `FAR` and the scene's extent. In this
+    case, the local frame gains at least one bit of precision. Otherwise the local origin is zero.
     """
     if not sizes:
         return np.zeros(3)

@@ -100,7 +100,7 @@ class AntennaPattern:
         field = self.amplitude(zenith, azimuth)[:, None, None] * polarization
         antenna_basis = spherical_basis(local, pole_reference=False) @ to_world.T
         wave = rotate_jones(field, rotate(direction, antenna_basis, spherical_basis(direction)))
-        # An arriving wave travels against `direction`, so its phi axis points the other way.
+        # An arriving wave travels opposite to `direction`, so its phi axis is reversed.
         return (wave * [1, -1] if arriving else wave).astype(complex)
 
 

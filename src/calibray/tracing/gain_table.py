@@ -65,7 +65,8 @@ class TwoCuts:
         azimuth = (np.asarray(azimuth_deg, dtype=float) + 180.0) % 360.0 - 180.0
         down = -np.asarray(elevation_deg, dtype=float)
         horizontal, back = self._at(self.horizontal_db, -azimuth), np.abs(azimuth) / 180.0
-        # Both cuts contain the attenuation in front and at the back; these differences avoid counting it twice.
+        # Both cuts contain the attenuation in front and at the back; the differences below avoid counting this
+        # attenuation twice.
         front_db = self._at(self.vertical_db, down) - self.horizontal_db[0]
         back_db = self._at(self.vertical_db, 180.0 - down) - self.horizontal_db[180]
         return self.gain_dbi - (horizontal + (1 - back) * front_db + back * back_db)

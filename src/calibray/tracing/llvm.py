@@ -5,7 +5,7 @@ choice is therefore made here, before Dr.Jit is imported. Every library is opene
 `DRJIT_LIBLLVM_PATH` is set to the best library.
 
 `python -m calibray.tracing.llvm` prints the Mitsuba variant and the library that the ray tracer will use. If no library
-is usable, it prints how to install one and exits with status 2.
+is usable, the command prints installation instructions and exits with status 2.
 """
 
 from __future__ import annotations

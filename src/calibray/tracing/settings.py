@@ -105,7 +105,7 @@ class Antenna:
             antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
         rows: Number of rows of a planar array of these antennas along its z axis; one signal feeds all antennas.
-        columns: Number of columns of the array along the antenna's y axis.
+        columns: Number of columns of the array along its y axis.
         spacing: Horizontal and vertical spacing of the antennas of the array [wavelengths].
 
     Raises:
@@ -160,7 +160,7 @@ class Antenna:
 
     @property
     def is_array(self) -> bool:
-        """Whether this is an array of several antennas."""
+        """Whether this antenna is an array of several antennas."""
         return self.rows * self.columns > 1
 
     @property

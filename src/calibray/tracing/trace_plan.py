@@ -102,7 +102,7 @@ class TracePlan:
     """The launches of a trace and their costs.
 
     Attributes:
-        launches: The launches; those to the same receivers are consecutive.
+        launches: The launches; launches to the same receivers are consecutive.
         lanes: Rays x interactions x receivers of the largest launch.
         buffer: Size of the buffer for the paths of a launch [bytes].
         adaptive: Whether each launch is the first of several, because rays are added until path loss converges.

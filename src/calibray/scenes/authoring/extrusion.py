@@ -82,7 +82,7 @@ def split_overlaps(
 
 
 def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
-    """Pieces of ground between the polygons' borders, and whether each polygon covers each piece [n, pieces]."""
+    """Divide the ground along the borders of polygons, and state which polygons cover each piece [n, pieces]."""
     shapely = library("shapely", "scenes")
     borders = shapely.union_all(shapely.boundary(polygons), grid_size=GRID)
     pieces = shapely.get_parts(shapely.polygonize([borders]))

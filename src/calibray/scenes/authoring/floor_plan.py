@@ -60,7 +60,7 @@ _OTHER_NAMES: Final = {
 
 @dataclass(frozen=True)
 class Segment:
-    """A vertical rectangle that stands on a line of a plan.
+    """A vertical rectangle above a line of a plan.
 
     Attributes:
         start: x and y of one end [m].
@@ -163,8 +163,8 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
     )
     if not USUAL_EXTENT[0] <= widest <= USUAL_EXTENT[1]:
         _LOG.warning(
-            "floor plan %s: is %g m wide; if that is wrong, state the unit of its coordinates, such as --unit 0.01 for "
-            "centimetres", path, widest,
+            "floor plan %s: is %g m wide; if this width is wrong, state the unit of its coordinates, such as --unit 0.01 "
+            "for centimetres", path, widest,
         )  # fmt: skip
     return segments
 

@@ -76,15 +76,15 @@ def make_plan_scene(
 
     Walls that cross or meet share corners. If a wall ends at the face of another wall, it is extended to the other
     wall's centre line. Between its own bottom and top, a door or window replaces the wall on which it is drawn; the
-    wall continues above and below. The same applies to any shorter line on a longer one, such as a door whose type has
-    a different name.
+    wall continues above and below. Any shorter line on a longer line is treated in the same way, for example a door
+    whose type has a different name.
 
     Args:
         segments: Lines of the plan.
         folder: Folder for `scene.xml`, `scene.json` and the meshes.
-        types: Materials by type, which extend or replace those in `TYPES`. A type that is an ITU-R P.2040 material,
-            such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one type,
-            each becomes a separate material.
+        types: Materials by type, which extend or replace the materials in `TYPES`. A type that is an ITU-R P.2040
+            material, such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one
+            type, each thickness becomes a separate material.
         lids: Which of `LIDS` to make. A floor or ceiling covers the whole area that walls enclose; the floor is at the
             lowest bottom of the walls, and the ceiling at their highest top.
         merge: Whether to merge two parallel lines into one wall (`merge_faces`).
@@ -210,7 +210,7 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """Cut lines at crossings. On each piece, doors and windows replace walls, and shorter lines replace longer ones."""
+    """Cut lines at crossings. On each piece of a line, doors and windows replace walls, and shorter lines replace longer lines."""
 
     def priority(number: int) -> tuple[bool, float, int]:
         return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number

@@ -327,7 +327,7 @@ def read_footprints(
             (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is interpreted
             as the name. The height can be None if `columns` names a column of numbers of storeys.
         columns: Additional columns.
-        layer: Layer of the file, if it has more than one.
+        layer: Layer to read if the file has more than one layer.
         frame: The scene's frame; by default, a local frame centred on the footprints.
         rule: Assumptions for buildings without a stated height.
 
@@ -424,7 +424,7 @@ def _numbers(
     Numbers are in metres, or in the unit stated in the name of the column. Text is parsed as a length.
 
     Raises:
-        InputError: There is no such column, or a value in it is not a height.
+        InputError: The column does not exist, or one of its values is not a height.
     """
     if isinstance(source, str) and source not in columns:
         with suppress(ValueError):

@@ -87,7 +87,7 @@ class Features:
 
 
 def read_features(path: Path, layer: str | None) -> Features:
-    """Read the features of a vector file in one of the `VECTOR_FORMATS`, or of one of its layers.
+    """Read the features of a vector file, or of one of its layers, in one of the `VECTOR_FORMATS`.
 
     Raises:
         InputError: The file does not exist, has an unsupported format, is damaged, or does not fit into memory.

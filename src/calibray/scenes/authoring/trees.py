@@ -183,7 +183,7 @@ def read_canopy(
         bounds: West, south, east and north bounds in the frame [4], [m].
 
     Returns:
-        Shapely polygons in the frame [n], [m], and the height of the trees in each [n], [m].
+        Shapely polygons in the frame [n], [m], and the height of the trees in each polygon [n], [m].
 
     Raises:
         InputError: The file cannot be used, or has no trees within the bounds.

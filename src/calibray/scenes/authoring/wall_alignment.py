@@ -179,7 +179,7 @@ def _group(segments: NDArray[np.float64], pairs: NDArray[np.int64], tolerance: f
 def _continues(
     segments: NDArray[np.float64], pairs: NDArray[np.int64], closeness: float
 ) -> NDArray[np.bool_]:
-    """Whether the shorter segment of each pair lies on the line of the longer one [P]."""
+    """Whether the shorter segment of each pair lies on the line of the longer segment [P]."""
     direction = segments[:, 1] - segments[:, 0]
     length = np.hypot(*direction.T)
     direction /= length[:, None]

@@ -123,7 +123,8 @@ def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int
         # Each pair covers this length on both of its lines.
         low, high = _span(segments[one], segments[other])
         faced[segments[one].kind] += 2 * (high - low)
-    # If a plan shows faces, nearly all of its lines are paired; if it shows walls as single lines, only a few are.
+    # If a plan shows faces, nearly all of its lines are paired; if it shows walls as single lines, only a few lines are
+    # paired.
     return {kind for kind in length if faced[kind] >= 0.5 * length[kind]}
 
 
@@ -170,7 +171,7 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 
 
 def _merge_pair(one: Segment, other: Segment) -> Segment:
-    """The sheet between two overlapping faces; where the faces' ends are close, the sheet ends midway between them."""
+    """The sheet between two overlapping faces; where their ends are close, the sheet ends midway between the ends."""
     low, high = sorted(_relative(one, other)[0].tolist())
     # At a corner, one face ends one wall thickness before the other. The point midway between their ends is on the
     # centre line of the other wall.

@@ -135,8 +135,8 @@ class SceneSurfaces:
             east, north = np.ravel(x)[missing[0]], np.ravel(y)[missing[0]]
             raise InputError(
                 f"heights above the ground: the scene has no ground at {len(missing)} of {len(lowest)} positions, "
-                f"the first at ({east:.1f}, {north:.1f}) m; make the scene with a wider --margin, or leave those rows "
-                "out"
+                f"the first at ({east:.1f}, {north:.1f}) m; make the scene with a larger --margin, or omit these "
+                "rows"
             )
         return lowest
 
@@ -149,7 +149,7 @@ class SceneSurfaces:
         return lowest
 
     def _count_surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Number of surfaces at each position in plan, and number of surfaces above it [n]."""
+        """Number of surfaces at each position in plan, and number of surfaces above the position [n]."""
         index, height = self._surfaces(position)
         above = height > position[index, 2] + CLEARANCE
         return np.bincount(index, minlength=len(position)), np.bincount(index[above], minlength=len(position))
@@ -175,7 +175,7 @@ class SceneSurfaces:
 def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLike) -> NDArray[np.int64]:
     """Count the triangles [F, 3, 3] that each straight line crosses; the ends of the lines are [n, 3], [m].
 
-    Crossings closer to each other than `SAME_CROSSING` count once.
+    Crossings closer to each other than `SAME_CROSSING` count as one crossing.
 
     Example:
         >>> sheet = np.array([[[1, -9, -9], [1, 9, -9], [1, 0, 9]]], float)
@@ -214,7 +214,7 @@ def building_outlines(source: str | Path) -> Any:
 def move_outside(
     points: ArrayLike, outlines: Any, clearance: float = 1.0, furthest: float = 20.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Move positions inside buildings to the nearest position outside them.
+    """Move positions inside buildings to the nearest positions outside the buildings.
 
     Args:
         points: Positions [n, 3], [m]; heights do not change.

@@ -132,10 +132,10 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
     """Reverse candidate paths, so that paths found from the receivers start at the transmitters.
 
     Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions.
-    Candidates for one direction are therefore also candidates for the other. Candidates are reversed before their
-    geometry is computed, so that a path is identical to the last digit, regardless of which end sent the rays. Three
-    properties depend on the direction: the order of the interactions, the two ends, and the faces of an edge, because
-    Sionna's 0-face is the illuminated face.
+    Candidates for one direction are therefore also candidates for the opposite direction. Candidates are reversed
+    before their geometry is computed, so that a path is identical to the last digit, regardless of which end sent the
+    rays. Three properties depend on the direction: the order of the interactions, the two ends, and the faces of an
+    edge, because Sionna's 0-face is the illuminated face.
     """
     if not buffer.buffer_size:
         return buffer

@@ -120,7 +120,7 @@ class Unfolded:
         aim: Image of the source; after the edge, image of the edge's origin [C, D, 3], [m].
         slide: Image of the edge's direction after the edge, 0 before the edge [C, D, 3].
         image: Image of the source in all planes [C, 3], [m].
-        edges: Images of the edges in all planes that follow them.
+        edges: Images of the edges in all planes that follow the edges.
     """
 
     kind: NDArray[np.int64]
@@ -289,7 +289,7 @@ def possible_pairs(
         )
         good = (edge_length == 0) | ((along_edge > -MARGIN) & (along_edge < edge_length + MARGIN))
         along_edge = dr.select(edge_length > 0, along_edge, 0)
-        # From the receiver backwards, the line must cross each plane where the scene has a surface.
+        # Traced back from the receiver, the line must cross each plane at a point where the scene has a surface.
         for step in reversed(range(depth)):
             at = sequence * depth + step
             kind = dr.gather(mi.UInt, kinds, at)

@@ -114,7 +114,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material], frequency:
         if name not in live.radio_materials:
             raise InputError(
                 f"the scene has no material {name!r}; {did_you_mean(name, live.radio_materials)}. If the study "
-                "creates materials for objects ([objects]), assign them to these objects in the scene as well"
+                "creates materials for objects ([objects]), assign these materials to the objects in the scene as well"
             )
     for name, material in materials.items():
         target = live.radio_materials[name]
@@ -138,7 +138,7 @@ def _checked(scene: object) -> Any:
 
 
 def _objects(item: Any) -> Iterator[MeshObject]:
-    """The connected surfaces of an object; their names differ from those of materials."""
+    """The connected surfaces of an object; their names differ from the names of materials."""
     values = mi.traverse(item.mi_mesh)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
     face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)

@@ -37,7 +37,7 @@ def load_scene(scene: Scene) -> rt.Scene:
     """Load a scene into Sionna RT, in its local frame; its mesh files are found relative to the scene file.
 
     Raises:
-        InputError: Sionna cannot load the scene, or its surfaces differ from those in the files.
+        InputError: Sionna cannot load the scene, or its surfaces differ from the surfaces in the files.
     """
     if has_copied_meshes(scene):
         with _temporary_folder(scene.path) as folder:
@@ -77,7 +77,7 @@ def _load(xml: str, path: Path) -> rt.Scene:
 
 
 def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
-    """Raise an error if the bounds or areas of surfaces in Mitsuba's memory differ from those in the files.
+    """Raise an error if the bounds or areas of surfaces in Mitsuba's memory differ from the files.
 
     Mitsuba reads mesh files itself; a type or layout that it misreads would remove reflections without a message.
     Mitsuba merges the objects of a material into one mesh, so the comparison is by material.
