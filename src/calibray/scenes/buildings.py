@@ -32,7 +32,7 @@ def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDA
 
     All indices are -1 if the scene consists only of ground.
     """
-    # Imported here because SciPy's spatial modules are slow to import and few users of this package need them.
+    # This import is local, because SciPy's spatial modules load slowly and few users of this package need them.
     from scipy import ndimage
     from scipy.spatial import KDTree
 

@@ -185,7 +185,7 @@ def _read_ply(content: bytes) -> Mesh:
             f"{len(vertices) - 1}"
         )
     misread = any(kind.kind != "f" for kind in stored)
-    # Only in single precision is the spacing large enough to matter.
+    # The spacing is large enough to matter only in single precision.
     is_single = any(kind == np.dtype(np.float32).newbyteorder(kind.byteorder) for kind in stored)
     step = float(np.spacing(np.float32(np.abs(vertices).max()))) if is_single else 0.0
     return Mesh(vertices, corners.astype(np.int64), step, misread)

@@ -139,7 +139,7 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of each line between two heights, as two fractions [k]; it is empty if the first is larger."""
+    """The part of each line between two heights, as two fractions [k]; it is empty if the first fraction is larger."""
     rise = last - first
     # A level line is between the heights along its whole length or nowhere.
     level = np.abs(rise) < 1e-9
@@ -195,7 +195,7 @@ class Obstruction:
     def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Knife-edge diffraction loss of the dominant roof edge [n], [dB], according to ITU-R P.526-15 equation 31.
 
-        The wavelength [m] is one value for all links, or one for each link [n].
+        The wavelength [m] is one value for all links, or one value for each link [n].
         """
         parameter = self.clearance / np.sqrt(wavelength)
         # The bound also replaces -inf, the clearance of lines that cross no roof, for which the equation is undefined.
@@ -449,8 +449,8 @@ CARRIERS: Final = (0.5e9, 67e9)
 def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.float64]:
     """Median loss in urban or suburban clutter at one end [n], [dB], according to ITU-R P.2108-1 section 3.2.
 
-    `distance` is the length of each path [n], [m]; `frequency` is one carrier frequency for all paths, or one for each
-    path [n], [Hz]. The loss is 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
+    `distance` is the length of each path [n], [m]; `frequency` is one carrier frequency for all paths, or one frequency
+    for each path [n], [Hz]. The loss is 0 for paths shorter than `SHORTEST`, which the recommendation does not cover.
 
     Raises:
         InputError: A carrier frequency is outside `CARRIERS`.
@@ -468,7 +468,7 @@ def clutter_loss_db(distance: ArrayLike, frequency: ArrayLike) -> NDArray[np.flo
             "omit this nuisance"
         )
     length_km = np.asarray(distance, dtype=float) / 1e3
-    # Beyond 2 km, the loss equals that at 2 km (equation 6).
+    # Beyond 2 km, the loss equals the loss at 2 km (equation 6).
     capped_km = np.clip(length_km, SHORTEST / 1e3, 2.0)
     long_db = -2 * np.log10(10 ** (-5 * np.log10(carrier_ghz) - 12.5) + 10**-16.5)  # equation 4
     short_db = 32.98 + 23.9 * np.log10(capped_km) + 3 * np.log10(carrier_ghz)  # equation 5

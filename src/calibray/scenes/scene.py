@@ -123,9 +123,9 @@ def read_scene(
     Args:
         source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
         frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
-        overrides: Constants that replace those in the file, by material name: a `Material`, or a mapping of its fields.
-            The mapping can also contain `itu`, an ITU-R P.2040 material, and `revision`, which applies to `itu` or to
-            the ITU material in the file.
+        overrides: Constants, by material name, that replace the constants in the file: a `Material`, or a mapping of
+            its fields. The mapping can also contain `itu`, an ITU-R P.2040 material, and `revision`, which applies to
+            `itu` or to the ITU material in the file.
         split: Separate materials for certain objects: a mapping from the name of each new material to a pattern of
             object names, in which `*` matches any text. If the material name ends in `*`, each object gets its own
             material, with `*` replaced by the object's name.
@@ -186,7 +186,7 @@ def read_scene(
 
 
 def has_copied_meshes(scene: Scene) -> bool:
-    """Whether the tracer reads copies of meshes, because of a local frame or a shape that it would misread."""
+    """Whether the tracer reads copies of meshes, because of a local frame or a shape that the tracer would misread."""
     return bool(scene.local_origin.any()) or any(size.misread for size in scene.sizes)
 
 
@@ -208,7 +208,7 @@ def check_material_name(name: str, materials: Mapping[str, object], location: st
     """Refuse a material that is not in a scene; `location` states where the user named the material.
 
     Raises:
-        InputError: The scene has no such material; the message suggests a similar name.
+        InputError: The material is not in the scene; the message suggests a similar name.
     """
     if name not in materials:
         raise InputError(f"{location}: the scene has no material {name!r}; {did_you_mean(name, materials)}")

@@ -209,8 +209,8 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
     if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
         raise InputError(
-            f"links: tx has the shape {tx.shape} and rx the shape {rx.shape}; both must have the shape [links, 3], with "
-            "at least one link"
+            f"links: tx has the shape {tx.shape} and rx the shape {rx.shape}; both must have the shape [links, 3], "
+            "with at least one link"
         )
     for name, position in (("tx", tx), ("rx", rx)):
         # NaN fails the comparison.

@@ -245,7 +245,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
 
 
 def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """The buildings to the left of an edge, limited to the heights [mm] at which no building is to the right."""
+    """The buildings to the left of an edge, limited to the heights [mm] at which there is no building to the right."""
     opposite = cell_of.get((edge[1], edge[0]))
     free = list(standing[cell_of[edge]])
     for low, high, _ in standing[opposite] if opposite is not None else ():

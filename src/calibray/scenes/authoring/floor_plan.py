@@ -270,7 +270,7 @@ def _parts(geometry: Any) -> list[NDArray[np.float64]]:
 
 
 def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.float64]:
-    """A column as numbers [n]; empty cells and absent columns become NaN."""
+    """Convert a column to numbers [n]; empty cells and absent columns become NaN."""
     if name not in frame:
         return np.full(len(frame), np.nan)
     column = frame[name]

@@ -210,7 +210,10 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """Cut lines at crossings. On each piece of a line, doors and windows replace walls, and shorter lines replace longer lines."""
+    """Cut lines at crossings.
+
+    On each piece, doors and windows replace walls, and shorter lines replace longer lines.
+    """
 
     def priority(number: int) -> tuple[bool, float, int]:
         return sheets[number].kind not in OPENINGS, round(sheets[number].length, 3), number

@@ -52,7 +52,7 @@ class HeightRule:
 
     Attributes:
         storey: Height of one storey [m].
-        default: Height of a building without a stated height or number of storeys [m].
+        default: Assumed height of a building without a stated height or number of storeys [m].
 
     Raises:
         InputError: A height is not a finite number greater than 0.
@@ -119,7 +119,7 @@ class Footprints:
         height_from: Source of each top [n].
         part: Whether each outline is a part of a building [n]; parts take precedence over the outline of the whole
             building.
-        repairs: Number of buildings that were changed, left out or given without a usable height, by reason.
+        repairs: Number of buildings, by reason, that were changed, were left out or have no usable height.
     """
 
     polygon: NDArray[Any]

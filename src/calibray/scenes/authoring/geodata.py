@@ -209,7 +209,7 @@ def _read_geojson(path: Path) -> Features:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    """A column as numbers if all values are numbers or missing, otherwise as objects."""
+    """Convert a column to numbers if all values are numbers or missing, otherwise to objects."""
     if all(
         value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values
     ):

@@ -1,4 +1,4 @@
-"""Makes scenes from footprints, and defines their materials and the record of assumptions in their files.
+"""Makes scenes from footprints, and writes scene files with materials and a record of assumptions.
 
 By default, roofs and walls have separate materials. Sionna RT finds wedges only within one mesh, so eaves diffract only
 if roofs and walls share a material (`Palette(roof=None)`). The vertical edges of walls always diffract.

@@ -220,7 +220,7 @@ def _undo_reversals(
     edges: NDArray[np.int64],
     level: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Move points back until no edge shrinks below half its length or reverses, and no level triangle turns over."""
+    """Move points back until no edge reverses or shrinks below half its length, and no level triangle is flipped."""
     result = moved.copy()
     before, area = points[edges[:, 1]] - points[edges[:, 0]], _area(points[level])
     while True:

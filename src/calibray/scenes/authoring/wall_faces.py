@@ -56,7 +56,7 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     is the median distance between their faces, weighted by length.
 
     If less than half of a type's total line length has an opposite face, each line of the type is treated as a wall.
-    Two lines that are close together are then separate walls, and both are kept.
+    In this case, two lines that are close together are separate walls, and both lines are kept.
 
     Returns the sheets, followed by the lines without an opposite face.
     """

@@ -22,7 +22,7 @@ KERB: Final = 2.0
 """Objects up to this height above the lowest point of a scene, such as kerbs, do not count as buildings [m]."""
 
 CLEARANCE: Final = 0.05
-"""A surface is above an antenna if it is higher by more than this distance [m]."""
+"""A surface counts as above an antenna if it is higher than the antenna by more than this distance [m]."""
 
 CONTACT: Final = 0.01
 """An antenna closer than this distance to a level surface counts as touching the surface [m]. At a distance of 1 mm,
@@ -218,13 +218,13 @@ def move_outside(
 
     Args:
         points: Positions [n, 3], [m]; heights do not change.
-        outlines: The area that buildings cover, from `building_outlines`.
+        outlines: The area that buildings cover, as returned by `building_outlines`.
         clearance: Distance of a moved position from the wall [m].
         furthest: Maximum distance by which a position is moved [m]; positions that would have to be moved farther
             become NaN.
 
     Returns:
-        The positions [n, 3], [m], NaN where the distance exceeds `furthest`; and the distance moved [n], [m].
+        The positions [n, 3], [m], which are NaN where the distance exceeds `furthest`, and the distance moved [n], [m].
 
     Raises:
         InputError: The clearance is not greater than 0, or a position is not finite.

@@ -64,7 +64,7 @@ class MeshFaults:
         open_edges: Number of edges that belong to only one face, even after vertices at the same position are merged.
         unwelded_edges: Number of edges at which two faces meet without sharing vertices, so no wedge is found.
         crowded_edges: Number of edges shared by more than two faces, so no wedge is found.
-        flipped_faces: Number of faces whose normals point inward, or opposite to those of their neighbours.
+        flipped_faces: Number of faces whose normals point inward, or opposite to the normals of their neighbours.
         empty_faces: Number of faces with zero area.
         repeated_faces: Number of faces with the same corners as another face.
     """
