@@ -220,7 +220,7 @@ def replaced(index: int, line: str | None) -> list[str]:
         (replaced(36, "180,-90,2\n"), r"row 38, column 'gain_dbi': 2 differs from the gain at azimuth -180, 0"),
         (rows()[37:], r"elevation_deg runs from -80 to 90, but must run from -90 to 90"),
         ([line for line in rows() if int(line.split(",")[0]) <= 90], r"azimuth_deg runs from -180 to 90 in steps"),
-        ([line for line in rows() if ",0,0" in line], r"column 'elevation_deg' contains 0 only; give a grid"),
+        ([line for line in rows() if ",0,0" in line], r"column 'elevation_deg' contains only 0; give a grid"),
         ([line for line in rows() if ",0,0" in line or line[:2] == "0,"], r"no row for .*principal cuts alone"),
         ([line.replace(",0\n", ",12\n") for line in rows()], r"would radiate 15\.8 times the power that it accepts"),
         (

@@ -347,7 +347,7 @@ def frame_comment(frame: Frame) -> str:
 
 
 def read_frame(source: str | Path) -> Frame | None:
-    """Read the geographic frame of a scene; None if its file states none.
+    """Read the geographic frame of a scene; None if its file states no frame.
 
     Raises:
         InputError: The scene does not exist, or its file states an invalid frame.

@@ -54,7 +54,7 @@ class SurfaceSize:
         sides: Total length of the sides of all triangles [m].
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
         misread: Whether the tracer needs a copy, because the file stores integer coordinates, the shape is a rectangle,
-            or its transform rotates it about a vector that is not a unit vector.
+            or the transform rotates the shape about a vector that is not a unit vector.
     """
 
     low: tuple[float, float, float]
@@ -130,7 +130,7 @@ def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float
     """Compute the transform of a shape in double precision, as a matrix for homogeneous coordinates [4, 4].
 
     Raises:
-        InputError: An element is none of translate, scale, rotate and matrix, or has the wrong number of values.
+        InputError: An element is not translate, scale, rotate or matrix, or has the wrong number of values.
     """
     matrix = np.eye(4)
     for step in shape.findall("transform/*"):

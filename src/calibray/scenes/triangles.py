@@ -199,7 +199,7 @@ def vertical_crossings(
     # The lines are shifted by less than a micrometre, because a line through a common edge would cross both triangles.
     x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
-    # As the points are sorted by x, those within a triangle's width are contiguous.
+    # As the points are sorted by x, the points within a triangle's width are contiguous.
     first = np.searchsorted(x, low[:, 0], "left")
     count = np.searchsorted(x, high[:, 0], "right") - first
     batch = np.cumsum(count) // BATCH

@@ -1,6 +1,6 @@
 """Antennas: their patterns, their directions on every link, and the Jones vectors of departing and arriving paths.
 
-Patterns and polarizations are those of Sionna RT, in closed form and double precision. The field is polarized along one
+Patterns and polarizations follow Sionna RT, in closed form and double precision. The field is polarized along one
 slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4/5); its amplitude is the square root of
 the gain.
 
@@ -196,7 +196,7 @@ EVERY: Final = "*"
 
 
 NEW: Final = "new transmitters"
-"""Name that represents all transmitters of a population that have no measured links."""
+"""Name that represents all transmitters without measured links in a population."""
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
@@ -325,10 +325,10 @@ def antenna_response(
 ) -> tuple[Any, Any, Any]:
     """Response of a mounted antenna: amplitude, and components (cos, sin) of its theta vector in the waves' basis.
 
-    Each result has the shape [P]; the basis is that of `wave_basis`. There is one pose for each path; if `index` [P] is
-    given, it is the index of the pose of each path. `xp` is the array library: NumPy, or `jax.numpy` within a JAX
-    function that is differentiated with respect to the pose. The function `stored` prevents intermediate values from
-    being computed again at each use.
+    Each result has the shape [P]; the basis is returned by `wave_basis`. There is one pose for each path; if `index`
+    [P] is given, it is the index of the pose of each path. `xp` is the array library: NumPy, or `jax.numpy` within a
+    JAX function that is differentiated with respect to the pose. The function `stored` prevents intermediate values
+    from being computed again at each use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
@@ -378,7 +378,7 @@ def in_frame(jones: Any, axis: Any, arriving: bool, xp: Any = np) -> Any:
     """Jones vectors [P, ports, 2] in the frame of the interaction next to the antenna.
 
     `axis` is the unit theta vector in that frame [P, 2]: the field of an isotropic vertical antenna. An arriving wave
-    travels against the direction of arrival, so its phi axis is mirrored.
+    travels opposite to the direction of arrival, so its phi axis is mirrored.
     """
     sign = -1.0 if arriving else 1.0
     phi = sign * xp.stack([-axis[:, 1], axis[:, 0]], axis=-1)

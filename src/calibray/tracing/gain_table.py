@@ -1,7 +1,7 @@
 """Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file or an MSI file.
 
 Between grid points, the gain is interpolated bilinearly in decibels, including across the ends of the azimuth axis. In
-decibels, main lobes are nearly parabolas (as in 3GPP TR 38.901, Table 7.3-1), so the error is smallest where the
+decibels, main lobes are nearly parabolic (as in 3GPP TR 38.901, Table 7.3-1), so the error is smallest where the
 antenna radiates most. Nulls that are narrower than the grid spacing become shallower.
 
 Planning tools export a horizontal and a vertical cut in MSI Planet's text format (`TwoCuts`). Attenuations are relative
@@ -330,7 +330,7 @@ def _axis(
     axis = np.unique(values)
     if len(axis) < 2:
         raise InputError(
-            f"{table.source}: column {name!r} contains {axis[0]:g} only; give a grid over all directions "
+            f"{table.source}: column {name!r} contains only {axis[0]:g}; give a grid over all directions "
             "(principal cuts alone are not enough)"
         )
     steps = np.diff(axis)

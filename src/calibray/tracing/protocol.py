@@ -233,8 +233,8 @@ class EnclosedAntennas:
     Attributes:
         tx: Rows of the source file whose transmitter is inside a body.
         rx: Rows of the source file whose receiver is inside a body.
-        indoors: Whether most links have an antenna inside a body, as in an indoor scene; these antennas are then not
-            suspicious.
+        indoors: Whether most links have an antenna inside a body, as in an indoor scene; in this case, these antennas
+            are not suspicious.
         tx_below: Rows of the source file whose transmitter is below the ground.
         rx_below: Rows of the source file whose receiver is below the ground.
     """
@@ -247,7 +247,7 @@ class EnclosedAntennas:
 
     @property
     def ends(self) -> tuple[tuple[str, tuple[int, ...], tuple[int, ...]], ...]:
-        """Name of each end of the links, with its rows inside a body and below the ground."""
+        """Name of each end of the links, rows with its antenna inside a body, and rows with its antenna below the ground."""
         return ("transmitter", self.tx, self.tx_below), ("receiver", self.rx, self.rx_below)
 
     @classmethod

@@ -38,7 +38,7 @@ class TraceSettings:
         refraction: Follow transmission through surfaces.
         diffraction: Follow first-order diffraction at wedges.
         edge_diffraction: Also follow diffraction at free edges.
-        diffraction_lit_region: Keep diffracted paths to receivers in the lit region as well as in the shadow.
+        diffraction_lit_region: Keep diffracted paths to receivers in the lit region as well as in the shadow region.
         diffuse_reflection: Follow diffuse reflections.
         samples: Rays per transmitter, 1 to 10^12. With "auto", rays are added in rounds until path loss converges;
             "auto" cannot be combined with diffuse reflection.
@@ -97,7 +97,7 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class Antenna:
-    """An antenna with a pattern of Sionna RT, or with measured gains.
+    """An antenna with a Sionna RT pattern or measured gains.
 
     Attributes:
         pattern: "iso", "dipole", "hw_dipole" or "tr38901", or a gain file (see `read_gain_table`).

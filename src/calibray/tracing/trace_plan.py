@@ -142,7 +142,7 @@ class TracePlan:
 
 
 def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
-    """Whether the receivers send the rays: they do if there are fewer receivers than transmitters.
+    """Whether the receivers send the rays, which is the case if there are fewer receivers than transmitters.
 
     A path is the same in both directions, so it can be reversed after it has been found. Diffuse reflection is not
     reversible: the scattered direction, and the probability with which the tracer chose it, belong to one direction of

@@ -163,8 +163,8 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
     )
     if not USUAL_EXTENT[0] <= widest <= USUAL_EXTENT[1]:
         _LOG.warning(
-            "floor plan %s: is %g m wide; if this width is wrong, state the unit of its coordinates, such as --unit 0.01 "
-            "for centimetres", path, widest,
+            "floor plan %s: is %g m wide; if this width is wrong, state the unit of its coordinates, such as --unit "
+            "0.01 for centimetres", path, widest,
         )  # fmt: skip
     return segments
 

@@ -88,7 +88,7 @@ class TracedBuffer:
 
 
 def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
-    """Remove the entries that Sionna RT 2.2 counts but does not fill, which occur with refraction.
+    """Remove the entries that Sionna RT 2.2 counts but does not fill; empty entries occur with refraction.
 
     An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each
     empty entry into another direct path between these ends.

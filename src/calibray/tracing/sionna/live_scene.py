@@ -159,7 +159,7 @@ def _objects(item: Any) -> Iterator[MeshObject]:
 
 
 def _check_precision(objects: Iterable[MeshObject]) -> None:
-    """Refuse a scene, or warn, if single precision rounds its coordinates noticeably far from the origin."""
+    """Refuse a scene, or give a warning, if single precision noticeably rounds coordinates far from the origin."""
     furthest = max((float(np.abs(item.mesh.vertices).max()) for item in objects), default=0.0)
     step = float(np.spacing(np.float32(furthest)))
     where = f"the scene reaches {furthest:.0f} m from its origin"

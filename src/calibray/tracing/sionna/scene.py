@@ -140,7 +140,7 @@ def surfaces_agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin:
 
 
 def shape_ids(mitsuba_scene: Any) -> dict[int, Any]:
-    """Mitsuba's shapes, by the ids with which path buffers refer to them."""
+    """Mitsuba's shapes, by the ids with which path buffers refer to the shapes."""
     return {
         int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): shape
         for shape in mitsuba_scene.shapes()

@@ -238,8 +238,8 @@ class Tracer:
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n].
 
-        A ray from inside a closed body crosses its surface an odd number of times. Because scenes have gaps, rays are
-        sent in several directions, and the majority decides. All rays point upwards, because buildings often lack a
+        A ray from inside a closed body crosses its surface an odd number of times. Because surfaces can have gaps, rays
+        are sent in several directions, and the majority decides. All rays point upwards, because buildings often lack a
         floor. A room is also a closed body.
         """
         azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
