@@ -180,7 +180,7 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
         )
     refused("study.toml: is a list, must be a dictionary", lambda: cb.Study.from_content([1]))
     refused(
-        r"links: is a pandas\.DataFrame, must have positions",
+        r"links: is a pandas\.DataFrame, but must have positions",
         lambda: cb.trace("sionna:munich", table, frequency=3e9),
     )
     refused(r"not a pandas\.DataFrame; use read_measurements", lambda: cb.trace(study, table))

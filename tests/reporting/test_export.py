@@ -296,5 +296,5 @@ def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
     ):
         assert old in sound
         target.write_text(sound.replace(old, new))
-        with pytest.raises(InputError, match=f"is not the calibrated scene: .*{message}"):
+        with pytest.raises(InputError, match=f"differs from the calibrated scene: .*{message}"):
             verify(scene, target)

@@ -390,7 +390,7 @@ def test_a_thickness_in_another_unit_is_refused(tmp_path, thickness, stated):
     plan = tmp_path / "plan.csv"
     plan.write_text(f"x0,y0,x1,y1,type,thickness\n0,0,5,0,brick,{thickness}\n")
     with pytest.raises(
-        InputError, match=rf"row 2: thickness = {stated} m, must be 0\.0005 to 3 m; state its unit"
+        InputError, match=rf"row 2: thickness = {stated} m, but must be 0\.0005 to 3 m; state its unit"
     ):
         read_plan(plan)
     plan.write_text("x0,y0,x1,y1,type,thickness_cm\n0,0,5,0,brick,24\n")

@@ -142,7 +142,7 @@ def test_a_missing_file_is_refused(tmp_path: Path, name: str) -> None:
 
 
 def test_an_unknown_bundled_scene_is_refused() -> None:
-    with pytest.raises(InputError, match=r"'sionna:munch'.*it has .*munich"):
+    with pytest.raises(InputError, match=r"'sionna:munch'.*choose one of .*munich"):
         read_scene("sionna:munch", 2e9)
 
 

@@ -247,7 +247,7 @@ class EnclosedAntennas:
 
     @property
     def ends(self) -> tuple[tuple[str, tuple[int, ...], tuple[int, ...]], ...]:
-        """Name of each end of the links, rows with its antenna inside a body, and rows with its antenna below the ground."""
+        """Name of each end of the links, rows with its antenna inside a body, and rows with it below the ground."""
         return ("transmitter", self.tx, self.tx_below), ("receiver", self.rx, self.rx_below)
 
     @classmethod
