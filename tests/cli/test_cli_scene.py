@@ -152,7 +152,7 @@ def write_town(path: Path, *properties: dict, move: tuple[float, float] = (0.0, 
         (
             ["--height", "tall"],
             (0, 0),
-            r"polygon 2: tall = 1e\+12, must be finite, not negative and at most 1000",
+            r"polygon 2: tall = 1e\+12, but must be finite, not negative and at most 1000",
         ),
         (["--height", "1e300"], (0, 0), r"1e\+300 = 1e\+300, must be finite|at most 1000"),
         (["--height", "nan"], (0, 0), "at most 1000|must"),
