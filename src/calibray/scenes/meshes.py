@@ -112,7 +112,7 @@ def weld(
 
 
 def read_mesh(file: Path, kind: str) -> Mesh:
-    """Read a mesh file of kind "ply" or "obj", and refuse a file that Mitsuba would trace wrongly or crash on.
+    """Read a mesh file of kind "ply" or "obj", and refuse a file that would crash Mitsuba or be traced wrongly.
 
     Polygons of an OBJ file are split into triangles.
 
@@ -268,7 +268,7 @@ def ply_bytes(mesh: Mesh) -> bytes:
     Vertices are stored as 32-bit floats, or as 64-bit floats if rounding to 32 bits could move them by more than about
     0.1 mm.
     """
-    # Single precision halves the file size; beyond 4 km, its spacing is 0.5 mm or more.
+    # Single precision halves the file size; beyond 4 km, the spacing of its numbers is 0.5 mm or more.
     is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 3e-4
     name, stored = ("double", "<f8") if is_coarse else ("float", "<f4")
     header = (

@@ -78,7 +78,7 @@ class Features:
     Attributes:
         outline: Geometries [n].
         columns: Attributes by name, each [n].
-        crs: Coordinate reference system of the geometries; None if the file states none.
+        crs: Coordinate reference system of the geometries; None if the file states no system.
     """
 
     outline: NDArray[Any]

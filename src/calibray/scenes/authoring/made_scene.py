@@ -227,8 +227,8 @@ def make_scene(
         margin: Distance by which level ground extends beyond the buildings [m].
         ground: Whether to make the ground; without ground, buildings are closed at the bottom.
         per_building: Whether to make one mesh per building and material, named `BUILDING-MATERIAL`, instead of one mesh
-            per material. A study can then assign separate materials to individual buildings. Tracing many meshes takes
-            longer.
+            per material. With separate meshes, a study can assign separate materials to individual buildings. Tracing
+            many meshes takes longer.
         overwrite: Whether to replace files that Calibray did not write.
         trees: Trees. If `frame` is given, the trees within `margin` of the buildings are written to `TREES_FILE` next
             to the scene.
@@ -273,7 +273,7 @@ def make_scene(
 
 
 def _ground_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float64]:
-    """Height of the lowest ground under the walls of each building [n], [m], the base of the building's heights."""
+    """Lowest ground under the walls of each building [n], [m]; the building's heights are measured from this level."""
     if terrain is None:
         return np.zeros(len(footprints))
     shapely = library("shapely", "scenes")

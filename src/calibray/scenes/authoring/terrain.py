@@ -21,9 +21,9 @@ MAX_POINTS: Final = 4_000_000
 """Maximum number of points in a ground sheet, to limit memory use."""
 
 STEP: Final = 200.0
-"""A cell is suspicious if its height differs from those of all neighbouring cells by at least this amount [m]. The
-number -999 in feet, which marks gaps in some models, is a height of -304 m. Buildings and masts in surface models are
-rarely taller than this."""
+"""A cell is suspicious if its height differs from the heights of all neighbouring cells by at least this amount [m].
+The number -999 in feet, which marks gaps in some models, is a height of -304 m. Buildings and masts in surface models
+are rarely taller than this amount."""
 
 _LOG: Final = logging.getLogger(__name__)
 

@@ -115,7 +115,7 @@ class Trees:
 def read_trees(path: str | Path, frame: Frame) -> Trees:
     """Read the trees in an extract: nodes, ways and areas with a tag in `KINDS`.
 
-    The tags `height` and `diameter_crown` are used if they are present, otherwise `HEIGHTS` and `CROWN`.
+    The tags `height` and `diameter_crown` are used if present; otherwise, `HEIGHTS` and `CROWN` are used.
 
     Raises:
         InputError: The file cannot be read, or pyosmium is not installed.

@@ -273,7 +273,8 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
             gap = height - centroid[point, 2]
             own = members[point]
             cosine = np.abs((normal[face] * normal[own]).sum(axis=1))
-            # The gap along the axis times the component of the normal along it is the distance between the faces.
+            # The gap along this axis times the component of the normal along the axis is the distance between the
+            # faces.
             near = (cosine > _PARALLEL) & (np.abs(gap * normal[own, axis]) < CLOSE) & (face != own)
             found[point[near]] = face[near]
             np.add.at(above, point, gap > CLOSE)

@@ -80,7 +80,7 @@ class Rays:
 
 
 class Solver:
-    """The stages of Sionna RT's solver for one loaded scene; arguments and errors are those of `Tracer`."""
+    """The stages of Sionna RT's solver for one loaded scene; arguments and errors are the same as in `Tracer`."""
 
     def __init__(
         self,
@@ -259,7 +259,7 @@ class Solver:
                 one_edge = {
                     "edge": to_numpy(wedges.e_hat), "normal_n": to_numpy(wedges.nn), "edge_lengths": lengths
                 }  # fmt: skip
-                # A path of Sionna RT has at most one diffraction, at any step.
+                # A Sionna RT path has at most one diffraction, which can occur at any step.
                 wedge_arrays = {
                     name: np.broadcast_to(values[:, None], (count, depth, values.shape[1]))
                     for name, values in one_edge.items()

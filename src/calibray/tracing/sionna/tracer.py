@@ -250,7 +250,7 @@ class Tracer:
         origin = np.repeat(local, directions.shape[1], axis=0)
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(directions, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
-        # At every surface, a ray passes from inside to outside or back.
+        # At every surface, a ray passes from inside to outside or vice versa.
         for _ in range(64):
             hit = self.solver.mitsuba_scene.ray_intersect(ray, mi.Bool(active))
             active &= np.array(hit.is_valid(), dtype=bool)
