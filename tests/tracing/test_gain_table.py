@@ -207,7 +207,7 @@ def replaced(index: int, line: str | None) -> list[str]:
     ("lines", "message"),
     [
         (replaced(40, None), r"no row for azimuth_deg = -150, elevation_deg = -80 \(1 of 703 directions\); add it"),
-        (replaced(40, "-160,-80,0\n"), r"row 42: has the same direction as row 41 \(repeated directions: 1\); remove one"),
+        (replaced(40, "-160,-80,0\n"), r"has the same direction as row 41 \(repeated directions: 1\); remove"),
         (replaced(40, "-150,-80,loud\n"), r"row 42, column 'gain_dbi': 'loud' is not a number"),
         (replaced(40, "-150,-80,\n"), r"has missing or non-finite values in 1 of 703 rows \(row 42\)"),
         (replaced(40, "-150,-80,-inf\n"), r"column 'gain_dbi' has missing or non-finite values"),
