@@ -166,7 +166,7 @@ def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
             {**PROFILE, "kind": "azimuth_power_arrival", "edges": [], "edges_deg": [0, 180, 400]},
             "must span at most 360",
         ),
-        ({**SPREAD, "column": None, "columns": ["a", "b"]}, "has a single column"),
+        ({**SPREAD, "column": None, "columns": ["a", "b"]}, "has only one column"),
     ],
 )
 def test_impossible_observables_are_refused(tmp_path, table, section, message):

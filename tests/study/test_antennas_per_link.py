@@ -368,7 +368,7 @@ def test_directions_have_gaussian_priors_and_materials_have_not(planted: Study) 
     study = misdirected(planted, **{"tx:north.azimuth": {"bounds": [-30.0, 30.0], "prior": {"std": 5.0}}})
     assert (study.priors.index, study.priors.centre) == ((1,), (0.0,))
     assert (study.priors.spread, study.priors.linear) == ((5.0,), (1,))
-    with pytest.raises(InputError, match=r"prior.std is for antennas"):
+    with pytest.raises(InputError, match=r"prior.std applies only to parameters of antennas"):
         misdirected(planted, **{"ground.conductivity": {"bounds": [0.1, 2.0], "prior": {"std": 0.1}}})
 
 

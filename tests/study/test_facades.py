@@ -234,8 +234,8 @@ def test_a_facade_is_like_the_walls_that_it_is_part_of(tmp_path):
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        ({"like": "marbel.relative_permittivity"}, "is not another parameter"),
-        ({"like": SHOP}, "is not another parameter"),
+        ({"like": "marbel.relative_permittivity"}, "must name another parameter"),
+        ({"like": SHOP}, "must name another parameter"),
         ({"like": "marble.relative_permittivity", "itu": "glass"}, "one of itu, value and like"),
         ({"std": 1.0, "like": "marble.relative_permittivity"}, "remove itu, value, like"),
     ],
@@ -250,7 +250,7 @@ def test_impossible_populations_are_refused(tmp_path, prior, message):
     [
         ({"facades": {"shop": {"of": "marble"}}}, "needs a rule"),
         ({"facades": {"shop": {"of": "marble", "storeys": [2, 1]}}}, "first and the last"),
-        ({"facades": {"shop": {"of": "marble", "share": 0.2, "column": "a"}}}, "column needs file"),
+        ({"facades": {"shop": {"of": "marble", "share": 0.2, "column": "a"}}}, "state file as well"),
         (
             {"facades": GROUND_FLOOR, "engine": {"name": "retrace"}},
             r"\[facades\] needs engine.name = 'replay'",

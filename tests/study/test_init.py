@@ -114,7 +114,7 @@ def test_values_that_the_receiver_clips_become_its_noise_floor(scene, tmp_path):
         below = int((rsrp == floor).sum()) if expected else 0
         assert found.study.measurements().prepared.get("at or below the noise floor, left out", 0) == below
         reasons = {each.what: each.reason for each in found.assumptions}
-        stated = f"{100 * below / 300:.0f} % of the values equal the lowest one" if expected else None
+        stated = f"{100 * below / 300:.0f} % of the values equal the lowest value" if expected else None
         assert reasons.get("links.noise_floor_dbm") == stated
 
 
@@ -139,7 +139,7 @@ def test_receivers_with_numbers_are_devices_and_the_directions_of_their_antennas
     found = draft(scene, file, tmp_path / "study.toml", frequency=60e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.offset.per == ("rx_id",)
     reasons = {each.what: each.reason for each in found.assumptions}
-    assert reasons["links.noise_floor_dbm"].endswith("none of rx_id 1, the least sensitive, is lower")
+    assert reasons["links.noise_floor_dbm"].endswith("no value of rx_id 1, the least sensitive device, is lower")
     assert reasons["links.rx_antenna.azimuth_deg"].startswith("column rx_azimuth_deg may describe")
 
 
@@ -169,7 +169,7 @@ def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_pa
     assert sorted(losses) == sorted(-power[(power > -82.0) & (power < -68.0)])
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
     share = f"{100 * (power == -68.0).mean():.0f} %"
-    assert reasons["links.where"] == f"{share} of the values equal the highest one: the receiver is saturated"
+    assert reasons["links.where"] == f"{share} of the values equal the highest value: the receiver is saturated"
 
 
 def test_saturated_values_in_single_precision_are_no_measurements(tmp_path, scene):
@@ -232,7 +232,7 @@ def test_trees_next_to_the_scene_become_a_region(scene, tmp_path):
     assert (section.file, section.heights, section.top) == ("town/trees.geojson", "ground", "top")
     assert section.specific_attenuation == pytest.approx(0.45 * 3.5**0.284, abs=0.005)
     assert "region:trees.specific_attenuation" in found.study.parameters
-    assert any("on the straight lines of 1 of 3 links" in each.reason for each in found.assumptions)
+    assert any("the straight lines of 1 of 3 links cross trees" in each.reason for each in found.assumptions)
     assert found.study.regions["trees"].file in found.text
     # Without trees on the straight line of a link, their attenuation is no parameter.
     elsewhere = draft(
@@ -513,7 +513,7 @@ def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(sce
     assert links.tx[:, 0].tolist() == [-30, -30, 60, 60, -30, -30, 60, 60, -30]
     # A column of numbers that happen to agree names nothing.
     other = table(tmp_path, x=np.arange(10.0), y=20.0, layer=[1, 2] * 5, rssi=np.arange(-80, -70))
-    with pytest.raises(InputError, match="no column contains the transmitters of the rows"):
+    with pytest.raises(InputError, match="no column names the transmitters of the rows"):
         draft(scene, other, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
 
 
@@ -555,7 +555,7 @@ def test_positions_in_centimetres_are_read_as_such(scene, tmp_path):
 
 def test_heights_in_another_unit_do_not_scale_the_other_columns(scene, tmp_path):
     rows = {"x": np.arange(10.0), "y": 20.0, "height_ft": 5.0, "rsrp_dbm": np.arange(-80, -70)}
-    with pytest.raises(InputError, match=r"state a unit of 0.3048 m, except x, y"):
+    with pytest.raises(InputError, match=r"state a unit of 0.3048 m, with the exception of x, y"):
         draft(scene, table(tmp_path, **rows), tmp_path / "study.toml", frequency=3.5e9, tx=(-30.0, 0.0, 15.0))
 
 

@@ -174,7 +174,7 @@ def test_a_missing_file_or_angle_is_named(scene, tmp_path, files):
         InputError, match=r"no file for 'k80010677_06t' of column 'Antenna Model'.*give the name of a file"
     ):
         drafted(scene, tmp_path, SECTORS, antennas=files)
-    with pytest.raises(InputError, match=r"contains no file \*.msi"):
+    with pytest.raises(InputError, match=r"contains no \*.msi"):
         drafted(scene, tmp_path, SECTORS, antennas=tmp_path)
     gap = SECTORS.assign(Azimuth=[20.0, None], MTilt=[2.0, 200.0])
     found = drafted(scene, tmp_path, gap)
@@ -206,7 +206,7 @@ def test_empty_angles_of_omnidirectional_antennas_count_as_zero(scene, tmp_path,
 
 def test_directional_antennas_without_an_angle_are_named(scene, tmp_path, files, caplog):
     with pytest.raises(
-        InputError, match=r"sites.csv: column 'Cell_Azimuth' in row 3 contains no number; write"
+        InputError, match=r"sites.csv: column 'Cell_Azimuth' in row 3 contains no number; enter"
     ):
         drafted(scene, tmp_path, SECTORS.assign(Azimuth=[20.0, None]), antennas=files)
     assert not caplog.messages

@@ -121,7 +121,7 @@ def test_coefficients_of_nuisance_terms_are_unknowns(town):
         (lambda t: t.assign(z=t.z + 540), "60 of 60 receivers are more than 300 m above the whole scene"),
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
          "5 of 60 receivers are inside buildings"),
-        (lambda t: t.assign(loss=t.loss - 30), "path losses are below free-space loss, by"),
+        (lambda t: t.assign(loss=t.loss - 30), "path losses are below free-space loss, with"),
         (lambda t: t.assign(z=np.where(t.index < 5, 0.0, t.z)), "5 of 60 receivers touch the ground"),
     ],
     ids=["swapped", "turned", "origin", "jump", "underground", "altitudes", "indoors", "watts", "height"],

@@ -126,14 +126,14 @@ def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine, co
         ({"regions": {"trees": {"boxes": [BOX], "specific_attenuation": 0.3}}}, r"needs top \[m\]"),
         ({"regions": {"trees": REGIONS["trees"] | {"boxes": [[5, 0, 1, 2]]}}}, "west less than east"),
         ({"regions": {"trees": REGIONS["trees"] | {"bottom": 9.0}}}, "must be less than top"),
-        ({"regions": {"trees": REGIONS["trees"] | {"top": "h"}}}, "column names need a file"),
+        ({"regions": {"trees": REGIONS["trees"] | {"top": "h"}}}, "column names apply only to a file"),
         (
             {
                 "regions": {},
                 "parameters": {"marble.relative_permittivity": PARAMETERS["marble.relative_permittivity"]},
                 "nuisance": {"trees": {"by": "region_m"}},
             },
-            r"no \[regions\]",
+            r"needs \[regions\]",
         ),
         ({"engine": {"name": "retrace"}}, "needs engine.name = 'replay'"),
         ({"engine": {"name": "replay", "compress_db": 0.1}}, "compress_db"),

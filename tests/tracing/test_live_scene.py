@@ -299,7 +299,7 @@ def test_what_is_not_a_matrix_of_path_loss_is_refused(measured: np.ndarray, tmp_
     refused(frame.iloc[[0, 0]], "row 'tx0' is repeated; give one row for each transmitter")
     refused(frame.iloc[:, [2, 2]], "column 'rx2' is repeated")
     refused(measured > 80, "tx0, rx0: (True|False), must be a finite real number")
-    refused(measured, "set its attribute frequency", scene={"frequency": 28e9})
+    refused(measured, "set the attribute frequency", scene={"frequency": 28e9})
     refused(measured, r"links: is \[1\], must be a dictionary", links=[1])
     refused(measured, "offset: is None, must be a dictionary", offset=None)
 

@@ -159,14 +159,14 @@ def test_a_planted_slope_is_recovered_reported_and_used_for_prediction(tmp_path,
     ("sections", "message"),
     [
         ({"nuisance": {"offset": {"by": "constant"}}}, "nuisance.offset"),
-        ({"nuisance": {"free offset": {"by": "constant"}}}, "nuisance.free offset: Calibray has a term"),
+        ({"nuisance": {"free offset": {"by": "constant"}}}, "nuisance.free offset: Calibray itself uses"),
         (
             {"nuisance": {"offset of the transmitter": {"by": "constant"}}},
-            "Calibray has a term with this name",
+            "Calibray itself uses this name",
         ),
         (
             {"nuisance": {"constant of all links": {"by": "log_distance"}}},
-            "Calibray has a term with this name",
+            "Calibray itself uses this name",
         ),
         ({"nuisance": {"a": {"by": "constant", "prior": 0}}}, "prior"),
         ({"holdout": {"blocks": 4, "by": "half"}}, "one of where, blocks and by"),

@@ -1,8 +1,8 @@
 """A single parameter: name, bounds, start value in a scene, and frequency law.
 
 The constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], with f in GHz (ITU-R P.2040). An ITU-R
-material has the coefficients of Table 3. The constants of any other material are independent of frequency, which
-corresponds to exponents of 0.
+material has the coefficients of Table 3. The constants of any other material do not depend on frequency, so their
+exponents are 0.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ CONSTANT_OF_FIELD: Final[Mapping[str, str]] = MappingProxyType(
         **{coefficient: constant for constant, law in LAWS.items() for coefficient in law},
     }
 )
-"""Fields that a parameter can set, each with the material constant that it changes."""
+"""Fields that a parameter can set, each with the material constant that the field changes."""
 
 EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
     {
@@ -62,11 +62,11 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
         "rx": {"dx": Bound(-1000.0, 1000.0, "m"), "dy": Bound(-1000.0, 1000.0, "m")},
     }
 )
-"""Kinds of effects that have parameters but are not materials, as in "region:trees.specific_attenuation", with the
-physical bounds of each field."""
+"""Kinds of effects that have parameters but are not materials, with the physical bounds of each field. An example of a
+parameter is "region:trees.specific_attenuation"."""
 
 ROUGHNESS: Final = "roughness_mm"
-"""Field of a material that is an effect on paths, not a constant."""
+"""Field of a material that describes an effect on paths, not a constant."""
 
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
@@ -89,17 +89,18 @@ class Parameter:
     Attributes:
         name: Material and field, separated by the last dot: "walls.relative_permittivity". Fields are the constants of
             a material, `roughness_mm`, and the coefficients `itu_a` to `itu_d` of the law of ITU-R P.2040: eps_r = a
-            f^b, sigma = c f^d [S/m], with f in GHz. For other effects, the kind precedes a colon:
+            f^b, sigma = c f^d [S/m], with f in GHz. For effects, the name begins with the kind and a colon:
             "region:trees.specific_attenuation".
         lower: Lower bound, in the unit of the field.
         upper: Upper bound, in the unit of the field.
         start: Value before calibration, within the bounds, in the unit of the field.
-        scale: "linear", or "log" for a constant that spans decades and has a positive lower bound.
-        at_lower: Length of an interval of the search space that maps to the value `lower`. With a prior, this value
-            then has a non-zero probability.
+        scale: "linear", or "log" for a parameter that spans decades and has a positive lower bound.
+        at_lower: Length of an interval of the search space that maps to the value `lower`. A prior then gives this
+            value a non-zero probability.
 
     Raises:
-        InputError: The field is unknown, or the bounds or the start value are out of order or physically impossible.
+        InputError: The field is unknown, the bounds and the start value are out of order, or one of these values is
+            physically impossible.
 
     Example:
         >>> Parameter("walls.relative_permittivity", lower=1.5, upper=12.0, start=5.0).material
@@ -144,7 +145,7 @@ class Parameter:
 
     @property
     def material(self) -> str:
-        """The part of the name before the last dot: the material, or the effect and its label."""
+        """The part of the name before the last dot: the material, or the kind and label of an effect."""
         return split_name(self.name)[0]
 
     @property
@@ -154,7 +155,7 @@ class Parameter:
 
     @property
     def constant(self) -> str:
-        """The material constant that the parameter changes, one of `FIELDS`; for an effect, the field itself."""
+        """The material constant (one of `FIELDS`) that the parameter changes; for an effect, the field itself."""
         return CONSTANT_OF_FIELD.get(self.field, self.field)
 
     @property
@@ -164,17 +165,17 @@ class Parameter:
 
 
 SCATTERING_SPREAD: Final = 0.25
-"""Standard deviation of a Gaussian. Its positive half is the prior of a scattering coefficient that is 0 in the scene,
-given that its true value is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et al.,
-IEEE Trans. Antennas and Propagation 55, 2007)."""
+"""Standard deviation of a Gaussian. The positive half of this Gaussian is the prior of a scattering coefficient that is
+0 in the scene, if the true value is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti
+et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
-    """A parameter for a constant that is fixed in the scene, with bounds at four standard deviations of its logarithm.
+    """A parameter for a constant that a study keeps fixed, with bounds at four standard deviations of the logarithm.
 
     A scattering coefficient of 0 is exactly 0 with a probability of one half. Otherwise, its prior is the positive half
-    of a Gaussian distribution with the standard deviation `SCATTERING_SPREAD`. The result is None if any other constant
-    is 0, if the bounds are impossible, or if the spread is 0.
+    of a Gaussian distribution with the standard deviation `SCATTERING_SPREAD`. The result is None if the spread is 0,
+    if the bounds are impossible, or if a constant other than a scattering coefficient is 0.
 
     Example:
         >>> fixed_constant("walls.thickness", 0.2, 0.1).upper
@@ -184,10 +185,10 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     """
     constant = split_name(name)[1]
     if constant == "scattering_coefficient" and value == 0.0 and spread > 0.0:
-        # Equal to the integral of the half Gaussian, whose density is scaled to 1 at 0.
+        # This length equals the integral of the half Gaussian, whose density is scaled to 1 at 0.
         return Parameter(name, 0.0, 3.0 * SCATTERING_SPREAD, 0.0, at_lower=SCATTERING_SPREAD * sqrt(pi / 2.0))
     bound, factor = PARAMETER_BOUNDS[constant], exp(4.0 * spread)
-    # The range ends at a physical bound, such as 1 for a scattering coefficient.
+    # The range ends at the physical bound, such as 1 for a scattering coefficient.
     lower, upper = value / factor, min(value * factor, bound.upper)
     if value <= 0.0 or spread <= 0.0 or lower not in bound or upper not in bound or lower >= upper:
         return None
@@ -213,10 +214,10 @@ def _of_kind(name: str) -> bool:
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Split the name of a parameter at the last dot into material and field.
+    """Split the name of a parameter into material and field at the last dot.
 
     Raises:
-        InputError: The name has no material, or the field is unknown.
+        InputError: The name lacks a material, or the field is unknown.
 
     Example:
         >>> split_name("block.7.thickness")
@@ -244,14 +245,14 @@ def start_value(
 
     Args:
         name: Material and field, such as "walls.relative_permittivity".
-        start: A value in the unit of the field, a name such as "itu:concrete" or "itu:concrete@P.2040-1" for the value
-            of ITU-R P.2040, or None for the value in the scene.
+        start: A value in the unit of the field; a name such as "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R
+            P.2040 value; or None for the value in the scene.
         base: The materials of the scene by name.
-        frequency: Frequency [Hz] of the ITU-R laws.
-        laws: Laws of materials by name. The constants of other materials are independent of frequency.
+        frequency: Frequency [Hz] at which the ITU-R laws are evaluated.
+        laws: Laws of materials by name. The constants of other materials do not depend on frequency.
 
     Raises:
-        InputError: The scene has no such material, the field has no effect with the scattering pattern of the material,
+        InputError: The scene lacks the material, the field has no effect with the scattering pattern of the material,
             the start value is not finite, or ITU-R P.2040 does not cover the material at this frequency.
 
     Example:
@@ -278,17 +279,19 @@ def start_value(
 
 
 def itu_start(name: str, start: str, frequency: float, key: str = "start") -> float:
-    """Look up the ITU-R P.2040 value for a start value such as "itu:concrete@P.2040-1", in the unit of the field.
+    """Look up the ITU-R P.2040 value for text such as "itu:concrete@P.2040-1", in the unit of the field.
 
     Messages name the `key` of the study that states the value.
 
     Raises:
-        InputError: The text has another form, or ITU-R P.2040 does not cover the field, or the material at this
-            frequency.
+        InputError: The text does not have this form, ITU-R P.2040 does not specify the field, or ITU-R P.2040 does not
+            cover the material at this frequency.
     """
     field = split_name(name)[1]
     if is_effect(name):
-        raise InputError(f"{name}: {start!r}: ITU-R P.2040 specifies only materials; give a number")
+        raise InputError(
+            f"{name}: {start!r}: ITU-R P.2040 specifies only materials, not effects; give a number"
+        )
     if not start.startswith(_ITU_PREFIX):
         raise InputError(
             f"{name}: {key} = {start!r}: must be a number or 'itu:NAME', such as 'itu:concrete@P.2040-1'"
@@ -306,15 +309,15 @@ def itu_start(name: str, start: str, frequency: float, key: str = "start") -> fl
 
 
 def _coefficient(law: ItuLaw, field: str) -> float:
-    """The coefficient of a law for the field `itu_a`, `itu_b`, `itu_c` or `itu_d`."""
+    """The coefficient of a law that the field `itu_a`, `itu_b`, `itu_c` or `itu_d` names."""
     return float(getattr(law, field.removeprefix("itu_")))
 
 
 def check_material(name: str, materials: Collection[str]) -> None:
-    """Reject a parameter of a material that is not in the scene.
+    """Raise an error if a parameter belongs to a material that is not in the scene.
 
     Raises:
-        InputError: The material is not in the scene. The message suggests the closest name.
+        InputError: The material is not in the scene. The message suggests the most similar name.
     """
     material = split_name(name)[0]
     if material not in materials:
@@ -352,13 +355,13 @@ def check_law(
     exponents: Iterable[float],
     frequencies: Iterable[float],
 ) -> None:
-    """Reject bounds of a law s f^e that allow an impossible value of a constant at any of the carriers [Hz].
+    """Raise an error if bounds of a law s f^e allow an impossible constant at any of the carriers [Hz].
 
     A power law is monotonic in both coefficients, so only the corners of the bounds are checked. A fixed coefficient
     has a single value.
 
     Raises:
-        InputError: s f^e is outside the bounds of the constant.
+        InputError: A value of s f^e is outside the physical bounds of the constant.
     """
     scale_name, exponent_name = LAWS[constant]
     for frequency, scale, exponent in product(frequencies, scales, exponents):

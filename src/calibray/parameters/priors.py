@@ -20,13 +20,13 @@ class LogNormal:
 
     Attributes:
         index: Indices of the parameters that have a prior.
-        centre: Medians, in the units of the parameters. For parameters in `like`, medians are relative to the other
+        centre: Medians, in the units of the parameters. For parameters in `like`, medians are ratios to the other
             parameter.
         spread: Standard deviations of the logarithms (0.3 corresponds to about 30 %), or of the values of parameters in
             `linear`.
         linear: Indices of the parameters with a Gaussian prior of the value, which can be negative.
-        like: Pairs of indices of a parameter and the parameter on which its prior is centred. Members of a population
-            scatter around a common value.
+        like: Pairs of indices: a parameter, and the parameter on which its prior is centred. In this way, members of a
+            population scatter around a common value.
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
@@ -44,7 +44,7 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, and independent log-normal priors of further parameters with a common spread.
+        """These priors, extended by independent log-normal priors of further parameters with a common spread.
 
         The priors of scattering coefficients that are centred on 0 have the standard deviation `SCATTERING_SPREAD`.
         """
@@ -62,12 +62,13 @@ class LogNormal:
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Least-squares residuals of the priors: (log value - log centre) / spread [n, k].
 
-        Candidates [n, d] are in the units of the fields. Values are positive, except for parameters in `linear`.
+        The candidates [n, d] are in the units of the fields. Their values are positive, except for parameters in
+        `linear`.
         """
         values, centre, linear = candidates[:, self._columns], np.array(self.centre), self._linear
         logarithm = np.log(np.where(linear, 1.0, values)) - np.log(np.where(linear, 1.0, centre))
         for row, reference in self._pairs:
-            # The centre is relative to the common value of the population.
+            # The centre is a multiple of the common value of the population.
             logarithm[:, row] -= np.log(candidates[:, reference])
         return np.where(linear, values - centre, logarithm) / self.spread
 
@@ -88,7 +89,7 @@ class LogNormal:
     ) -> NDArray[np.float64]:
         """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
 
-        The integral depends on the parameters on which these priors are centred. The integration variables are the
+        The integral depends on the parameters on which these priors are centred. The variables of integration are the
         search coordinates.
         """
         total = np.zeros(len(candidates))
@@ -96,7 +97,7 @@ class LogNormal:
             middle, low, high, tilt = self._interval(row, candidates[:, reference], parameters)
             # Integral over x of exp(-(log x - m)^2 / 2 s^2): exp(m + s^2 / 2) times a probability of N(m + s^2, s^2).
             total += tilt * (middle - tilt * self.spread[row] ** 2 / 2)
-            # The normal distribution is symmetric; below its mean, differences of probabilities lose no precision.
+            # The normal distribution is symmetric, and differences of probabilities lose no precision below the mean.
             below, above = np.where(low > 0, [-high, -low], [low, high])
             total += log_ndtr(above) + np.log1p(-np.exp(log_ndtr(below) - log_ndtr(above)))
         return total
@@ -104,7 +105,7 @@ class LogNormal:
     def draw_like(
         self, candidates: NDArray[np.float64], parameters: Parameters, random: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Candidates [n, d] with the parameters in `like` drawn around the parameters on which they depend."""
+        """Candidates [n, d], in which the parameters in `like` are drawn around the parameters on which they depend."""
         drawn = candidates.copy()
         for row, reference in self._pairs:
             middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
@@ -119,9 +120,10 @@ class LogNormal:
     def _interval(
         self, row: int, reference: NDArray[np.float64], parameters: Parameters
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Mean of the logarithm [n], and distance of each bound from this mean in standard deviations [n].
+        """Mean of the logarithm [n], and distance of each bound from this mean, in standard deviations [n].
 
-        The last result is 1 if the search coordinate is the value, which shifts the mean, and 0 if it is the logarithm.
+        The last result is 1 if the search coordinate is the value itself, which shifts the mean, and 0 if it is the
+        logarithm.
         """
         item, spread = parameters.items[self.index[row]], self.spread[row]
         tilt = 0.0 if item.scale == "log" else 1.0

@@ -26,7 +26,7 @@ _DEFAULT_LAW: Final = frequency_independent_law(Material(1.0, 0.0, 1.0))
 _UNBOUNDED: Final = 1e300
 
 MAX_PARAMETERS: Final = 10_000
-"""Largest number of parameters of a study."""
+"""Maximum number of parameters of a study."""
 
 
 class _Law(NamedTuple):
@@ -48,10 +48,10 @@ class Parameters:
         items: The parameters, at least one.
         frequency: Carrier frequency at which laws are evaluated by default [Hz].
         laws: Laws by material, for materials with a calibrated coefficient. The other coefficients are fixed at the
-            values of these laws. By default, the constants are independent of frequency.
+            values of these laws. By default, the constants do not depend on frequency.
 
     Raises:
-        InputError: There are no parameters, a name is repeated, or both a constant and a coefficient of its law are
+        InputError: There are no parameters, a name is repeated, or a constant and a coefficient of its law are both
             parameters.
 
     Example:
@@ -71,7 +71,7 @@ class Parameters:
         object.__setattr__(self, "items", tuple(self.items))
         if not self.items:
             raise InputError(
-                'parameters: none given; name at least one, such as "walls.relative_permittivity"'
+                'parameters: none given; give at least one parameter, such as "walls.relative_permittivity"'
             )
         if len(self.items) > MAX_PARAMETERS:
             raise InputError(
@@ -80,7 +80,7 @@ class Parameters:
             )
         counts = Counter(self.names)
         if repeated := [name for name, count in counts.items() if count > 1]:
-            raise InputError(f"parameters: {repeated[0]!r} is given twice; remove one of the two")
+            raise InputError(f"parameters: {repeated[0]!r} is given twice; remove one entry")
         for parameter in self.items:
             constant = _constant_name(parameter)
             if parameter.name != constant and constant in counts:
@@ -144,10 +144,10 @@ class Parameters:
     def constants_and_slopes(
         self, candidates: ArrayLike, frequency: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Constants that candidates determine at one carrier, and their derivatives, both [..., parameters].
+        """Constants that candidates determine at one carrier, and derivatives of the constants, both [..., parameters].
 
-        If `frequency` is None, the carrier is that of the parameters. Both coefficients of a law get the constant that
-        they determine together.
+        If `frequency` is None, the carrier is that of the parameters. Both coefficients of a law yield the constant
+        that they determine together.
 
         Raises:
             InputError: The candidates have the wrong length.
@@ -169,8 +169,8 @@ class Parameters:
     def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
         """The constants that the parameters determine at one carrier [Hz], as parameters.
 
-        Constants that follow a law have only physical bounds. The second result is the index of the constant that each
-        original parameter determines [parameters].
+        A constant that follows a law has only its physical bounds. The second result is, for each original parameter,
+        the index of the constant that it determines [parameters].
         """
         if not self.has_laws:
             return self, np.arange(len(self))
@@ -179,7 +179,7 @@ class Parameters:
         for parameter, start in zip(self.items, starts.tolist(), strict=True):
             name = _constant_name(parameter)
             if name != parameter.name:
-                # The bounds of a coefficient do not bound the constant.
+                # The bounds of a coefficient are not bounds of the constant.
                 parameter = Parameter(name, PARAMETER_BOUNDS[parameter.constant].lower, _UNBOUNDED, start)
             constants.setdefault(name, parameter)
         number = {name: index for index, name in enumerate(constants)}
@@ -204,10 +204,10 @@ class Parameters:
         return coefficients
 
     def check_carriers(self, frequencies: Sequence[float]) -> None:
-        """Reject bounds of laws that allow an impossible value of a constant at any of the carriers [Hz].
+        """Raise an error if bounds of laws allow an impossible constant at any of the carriers [Hz].
 
         Raises:
-            InputError: A law exceeds the bounds of its constant. The message names the carrier.
+            InputError: A law exceeds the physical bounds of its constant. The message names the carrier.
         """
         for law in self._laws():
             scales = (law.fixed_scale,) if law.scale is None else self._bounds(law.scale)
@@ -323,7 +323,7 @@ class Parameters:
         """Convert points of the search space [..., parameters] to candidates within the bounds."""
         values = self._components(points)
         values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, values, 0.0)), values)
-        # Rounding of exp and log could otherwise exceed the bounds by an ulp.
+        # Without clipping, rounding in exp and log could exceed the bounds by one unit in the last place.
         return np.clip(values, self.lower, self.upper)
 
     def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:

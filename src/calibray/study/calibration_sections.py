@@ -1,4 +1,4 @@
-"""The sections of a study file that define the calibration. The sections are closed: unknown keys are errors."""
+"""The sections of a study file that define the calibration. Unknown keys in these sections are errors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from calibray.support.strict_models import Section, Text
 
 
 class ObjectiveSection(Section):
-    """``[objective]``: how paths combine into a path loss, and how links without a path are treated.
+    """``[objective]``: how path loss is computed from the paths, and how links without a path are treated.
 
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
             over the bandwidth).
-        no_path: "exclude" omits links without a path from the objective; "censor" assigns `ceiling_db` to them.
-        ceiling_db: Largest measurable path loss [dB]; only with "censor".
+        no_path: "exclude" omits links without a path from the objective; "censor" sets their modelled path loss to
+            `ceiling_db`.
+        ceiling_db: Largest measurable path loss [dB]; allowed only with "censor".
     """
 
     combining: Literal["power", "coherent", "band"] = "power"
@@ -48,13 +49,13 @@ class PriorSection(Section):
     Attributes:
         itu: Name of the ITU-R P.2040 material on which the prior is centred, with or without "@REVISION".
         value: Value on which the prior is centred, in the unit of the parameter, instead of `itu`.
-        like: Name of another parameter on which the prior is centred, instead of `itu`. Both parameters belong to one
-            population.
-        spread: Standard deviation of the natural logarithm; 0.3 corresponds to about 30 %.
+        like: Name of another parameter on which the prior is centred, instead of `itu`. Both parameters are then
+            members of the same population.
+        spread: Standard deviation of the natural logarithm of the parameter; 0.3 corresponds to about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the unit of the parameter. This key
             replaces `itu`, `value`, `like` and `spread`.
-        shared: Whether `std` is the spread of a population of transmitters, which is estimated if the parameter's
-            `spread` is "auto".
+        shared: Whether `std` is the standard deviation across a population of transmitters. It is estimated if the
+            `spread` of the parameter is "auto".
     """
 
     itu: Text | None = None
@@ -73,7 +74,7 @@ class PriorSection(Section):
                 )
             return self
         if self.spread is None:
-            raise InputError("a prior needs either spread, the standard deviation of the logarithm, or std")
+            raise InputError("a prior needs spread (the standard deviation of the logarithm) or std")
         if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
             raise InputError(
                 "a prior is centred on an ITU material, a value or another parameter: give exactly one of itu, value "
@@ -91,8 +92,8 @@ class ParameterSection(Section):
             is used.
         scale: "linear" or "log".
         prior: Prior of the parameter; uniform within the bounds if absent.
-        spread: Standard deviation of individual transmitters around the common value of a parameter such as
-            "tx:*.azimuth", in the unit of the parameter; "auto" to estimate it. If absent, only the common value is
+        spread: Standard deviation between transmitters of a parameter such as "tx:*.azimuth", in the unit of the
+            parameter; "auto" estimates this standard deviation. If absent, only the value common to all transmitters is
             calibrated.
     """
 
@@ -103,11 +104,11 @@ class ParameterSection(Section):
     spread: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The centre of the prior at a carrier [Hz], in the parameter's unit; 1 if another parameter is the centre.
+        """The centre of the prior at a carrier [Hz], in the parameter's unit; 1 if the centre is another parameter.
 
         Raises:
-            InputError: There is no prior, ITU-R P.2040 does not specify this constant, or the lower bound or the value
-                is not positive.
+            InputError: The parameter has no prior, ITU-R P.2040 does not specify the constant, or the value or the
+                lower bound is not positive.
         """
         if self.prior is None:
             raise InputError(f"{name}: has no prior")
@@ -116,7 +117,7 @@ class ParameterSection(Section):
             value = itu_start(name, f"itu:{self.prior.itu}", frequency, "prior.itu")
         if not min(value, self.bounds[0]) > 0:
             raise InputError(
-                f"{name}: a log-normal prior needs a positive value and a positive lower bound, but these are "
+                f"{name}: a log-normal prior needs a positive value and a positive lower bound, but they are "
                 f"{value:g} and {self.bounds[0]:g}"
             )
         return value
@@ -152,9 +153,9 @@ class OffsetSection(Section):
     """``[offset]``: the nuisance term "offset" [dB], one value for all links or one per group.
 
     Attributes:
-        per: Column of group labels, or several columns whose labels are joined. If absent, all links have one offset.
-        bounds: Lower and upper bounds [dB]; unbounded if absent.
-        prior_db: Standard deviation of a Gaussian prior around zero [dB]; a flat prior if absent.
+        per: Column of group labels, or several columns whose labels are joined. If absent, all links share one offset.
+        bounds: Lower and upper bounds of the offset [dB]; unbounded if absent.
+        prior_db: Standard deviation of a Gaussian prior around zero [dB]. If absent, the prior is flat.
     """
 
     per: Text | tuple[Text, ...] | None = None
@@ -179,7 +180,7 @@ TX_OFFSET: Final = "offset of the transmitter"
 """Name of the nuisance term with one offset per transmitter, used in predictions."""
 
 OF_ALL_LINKS: Final = " of all links"
-"""Suffix of the names of nuisance terms that predictions add with one coefficient for all links."""
+"""Suffix of the name of each nuisance term that predictions add with one coefficient for all links."""
 
 
 class NuisanceSection(Section):
@@ -189,11 +190,11 @@ class NuisanceSection(Section):
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Column of group labels. If absent, there is one coefficient for all links. "cluster" needs no column if
-            `cluster_m` is stated.
-        cluster_m: Side length of the squares that group the receivers if `per` is "cluster" [m].
+        per: Column of group labels. If absent, there is one coefficient for all links. With `cluster_m`, "cluster"
+            needs no column.
+        cluster_m: Side length [m] of the squares into which receivers are grouped if `per` is "cluster".
         bounds: Lower and upper bounds of the coefficient, in dB per unit of the column; unbounded if absent.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; a flat prior if absent. With
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit. If absent, the prior is flat. With
             "auto", the prior is centred on the mean of the groups and its standard deviation is estimated (a random
             effect).
     """
@@ -213,7 +214,7 @@ class NuisanceSection(Section):
                 "prior = 'auto' needs per, the column of the groups, and cannot be combined with bounds"
             )
         if self.cluster_m is not None and self.per != CLUSTER:
-            raise InputError(f"cluster_m, the side length of squares, needs per = {CLUSTER!r}")
+            raise InputError(f"cluster_m, the side length of the squares, needs per = {CLUSTER!r}")
         return self
 
     def term(self) -> NuisanceTerm:
@@ -222,17 +223,17 @@ class NuisanceSection(Section):
 
 
 class NoiseSection(Section):
-    """``[noise]``: the errors of measured links.
+    """``[noise]``: the errors of the measured links.
 
     Attributes:
         std_db: Standard deviation of the error of a link [dB], which determines the weight of the priors. If absent, it
             is estimated.
-        kind: "gaussian", "student-t", or "auto" for intervals that account for both.
+        kind: Distribution of the errors: "gaussian", "student-t", or "auto" for intervals that account for both.
         range_m: Correlation distance of the errors of neighbouring links [m]; 0 for no correlation, or "auto".
         heterogeneity: Between-building spread of the constants of a material; 0 for no spread, or "auto".
-        constants_spread: Standard deviation of the logarithm of those constants of calibrated materials (thickness,
-            conductivity, scattering coefficient) that are not parameters; 0 if the values in the scene are exact. A
-            scattering coefficient of 0 has a separate prior, unless `constants_spread` is 0.
+        constants_spread: Standard deviation of the logarithm of a fixed constant (thickness, conductivity, scattering
+            coefficient) of a calibrated material. State 0 if the values in the scene are exact. A scattering
+            coefficient of 0 has a separate prior, unless `constants_spread` is 0.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
@@ -270,7 +271,7 @@ class HoldoutSection(Section):
     Attributes:
         where: Row filter that selects the held-out links.
         blocks: Number of spatial blocks, each held out in turn.
-        by: Column of labels; the links with each label are held out in turn.
+        by: Column of labels; all links with the same label are held out together.
     """
 
     where: Text | None = None
@@ -285,7 +286,7 @@ class HoldoutSection(Section):
 
 
 class FidelitySection(Section):
-    """``[fidelity]``: further traces with the calibrated materials, because the paths can depend on the materials.
+    """``[fidelity]``: repeated tracing with the calibrated materials, because the paths can depend on the materials.
 
     Attributes:
         tolerance_db: Largest accepted change in the path loss of a link [dB].
@@ -302,7 +303,7 @@ class MethodSection(Section):
     Attributes:
         name: "auto", "sgwo-im", "gwo" or another registered method.
         seed: Seed of the method's random numbers.
-        model: The cheap model of an expensive engine: "replay" of the study's scene, or "none".
+        model: Cheap model that approximates an expensive engine: "replay" of the study's scene, or "none".
         options: Settings of the method `name`.
     """
 
@@ -337,7 +338,8 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     If the method is unknown or is chosen later, only the sizes are checked.
 
     Raises:
-        InputError: A setting is unknown, of the wrong type, not finite or too large. The message begins with its key.
+        InputError: A setting is unknown, of the wrong type, not finite or too large. The message begins with the key of
+            the setting.
     """
     if not options:
         return
@@ -361,7 +363,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
-    """Check a value against its argument's type annotation, unless that names a type missing from `_TYPES`."""
+    """Check a value against the annotated type of its argument; types missing from `_TYPES` are not checked."""
     types = [part.strip() for part in str(argument.annotation).split("|")]
     if not set(types) - {"None"} <= set(_TYPES):
         return

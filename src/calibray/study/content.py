@@ -104,7 +104,7 @@ class StudyContent(Section, ABC):
         reserved = (sections.OFFSET, sections.FREE_OFFSET, sections.TX_OFFSET)
         for name in self.nuisance:
             if name in reserved or name.endswith(sections.OF_ALL_LINKS):
-                raise InputError(f"nuisance.{name}: Calibray has a term with this name; choose another name")
+                raise InputError(f"nuisance.{name}: Calibray itself uses this name; choose another name")
         if getattr(self.engine, "rays", None) and (
             self.links.mountings or self.links.position_error_m is not None
         ):
@@ -115,8 +115,8 @@ class StudyContent(Section, ABC):
         if self.links.mountings and self.engine.name != "replay":
             end = next(iter(self.links.mountings))
             raise InputError(
-                f"links.{end}_antenna with engine.name = {self.engine.name!r}: antennas that differ between links are "
-                "applied to stored paths; use engine 'replay'"
+                f"links.{end}_antenna with engine.name = {self.engine.name!r}: antennas that differ between links need "
+                "stored paths; use engine 'replay'"
             )
         self._check_materials()
         self._check_parameters()
@@ -142,13 +142,13 @@ class StudyContent(Section, ABC):
             )
 
     def _laws(self) -> dict[str, bool]:
-        """Label for parameters that are coefficients of frequency laws, and whether there are any."""
+        """Whether any parameter is a coefficient of a frequency law, with a label for messages."""
         return {
             "coefficients of laws": any(split_name(name)[1].startswith("itu_") for name in self.parameters)
         }
 
     def _without_replay(self) -> dict[str, bool]:
-        """Settings that rule out the replay of summed powers at one carrier, and whether each is stated."""
+        """Whether the study states each setting that rules out replay of summed powers at one carrier."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
@@ -162,10 +162,12 @@ class StudyContent(Section, ABC):
         if getattr(self.engine, "compress_db", None) is not None:
             raise InputError(
                 "engine.compress_db: compression to a few weighted paths preserves path loss, but not the delays and "
-                "angles of [observables]; remove one of the two"
+                "angles that [observables] need; remove one of the two"
             )
         if self.engine.name == "retrace":
-            raise InputError("[observables] with engine.name = 'retrace': use 'replay' or 'command'")
+            raise InputError(
+                "[observables] cannot be used with engine.name = 'retrace'; use 'replay' or 'command'"
+            )
         unstated = [name for name, section in self.observables.items() if section.std is None]
         if self.engine.expensive and (unstated or (self.links.std is None and self.noise.std_db is None)):
             missing = f"observables.{unstated[0]}.std" if unstated else "noise.std_db"
@@ -185,12 +187,12 @@ class StudyContent(Section, ABC):
             raise InputError("engine.rays: the rays of a table are not assigned to walls; remove [facades]")
         if len({item.cluster_m for item in self.nuisance.values()} - {None}) > 1:
             raise InputError(
-                "nuisance: cluster_m differs between terms; state the same side length for all of them"
+                "nuisance: cluster_m differs between terms; state the same side length for all terms"
             )
         for name, section in self.nuisance.items():
             if section.by == REGION and not self.regions:
                 raise InputError(
-                    f"nuisance.{name}.by = {REGION!r}: there are no [regions] for the straight lines to cross"
+                    f"nuisance.{name}.by = {REGION!r}: this column needs [regions], and the study has none"
                 )
         rough = [name for name in self.parameters if name.endswith(f".{ROUGHNESS}")]
         rough += [
@@ -202,7 +204,7 @@ class StudyContent(Section, ABC):
         for key, used in stated:
             if used and self.engine.name != "replay":
                 raise InputError(
-                    f"{key} needs engine.name = 'replay'; the engine {self.engine.name!r} has no paths"
+                    f"{key} needs engine.name = 'replay'; the engine {self.engine.name!r} stores no paths"
                 )
             if used and getattr(self.engine, "compress_db", None) is not None:
                 raise InputError(
@@ -218,7 +220,7 @@ class StudyContent(Section, ABC):
         key = _first_stated(stated | self._without_replay())
         if key is not None:
             raise InputError(
-                "links.position_error_m needs replay at one carrier, which averages powers at displaced receivers; it "
+                "links.position_error_m averages powers at displaced receivers by replay at one carrier; this key "
                 f"cannot be combined with {key}"
             )
         if links.std is None and self.noise.std_db is None:
@@ -231,11 +233,12 @@ class StudyContent(Section, ABC):
         names = [name for name in self.parameters if turns(name)]
         if names and self.links.tx_antenna is None:
             raise InputError(
-                f"parameters: {names[0]!r} needs [links.tx_antenna], the stated directions of the transmit antennas"
+                f"parameters: {names[0]!r} needs [links.tx_antenna], which states the directions of the transmit "
+                "antennas"
             )
         if names and getattr(self.engine, "compress_db", None) is not None:
             raise InputError(
-                f"engine.compress_db: a few weighted paths have no directions, which {names[0]!r} needs; remove "
+                f"engine.compress_db: compressed paths lack the directions that {names[0]!r} needs; remove "
                 "engine.compress_db"
             )
 
@@ -254,8 +257,8 @@ class StudyContent(Section, ABC):
         ]
         if own and links.device is None:
             raise InputError(
-                f"parameters: {own[0]!r} needs links.device, the column of device names; or displace all devices, as "
-                f"'{RECEIVER}{EVERY}.dx'"
+                f"parameters: {own[0]!r} needs links.device, the column of device names; alternatively, displace all "
+                f"devices with '{RECEIVER}{EVERY}.dx'"
             )
 
     def _check_materials(self) -> None:
@@ -276,12 +279,14 @@ class StudyContent(Section, ABC):
             parameters.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
             if entry.spread is not None and not name.startswith(f"{POSE}{EVERY}."):
                 raise InputError(
-                    f"{name}: spread describes a population of transmitters; state it for '{POSE}{EVERY}.azimuth' or "
-                    "another field, or remove it"
+                    f"{name}: spread describes a population of transmitters; state it for a parameter of all "
+                    f"transmitters, such as '{POSE}{EVERY}.azimuth', or remove it"
                 )
             if entry.prior is not None and entry.prior.std is not None:
                 if not name.startswith((POSE, RECEIVER)):
-                    raise InputError(f"{name}: prior.std is for antennas; give itu or value, and spread")
+                    raise InputError(
+                        f"{name}: prior.std applies only to parameters of antennas; give itu or value, and spread"
+                    )
             elif entry.prior is not None:
                 entry.centre(name, frequency)
                 self._check_like(name, entry.prior.like)
@@ -293,7 +298,7 @@ class StudyContent(Section, ABC):
         other, others = self.parameters.get(like), [known for known in self.parameters if known != name]
         if other is None or like == name:
             raise InputError(
-                f"{name}: prior.like = {like!r}: is not another parameter; {did_you_mean(like, others)}"
+                f"{name}: prior.like = {like!r}: must name another parameter; {did_you_mean(like, others)}"
             )
         if split_name(like)[1] != split_name(name)[1]:
             raise InputError(f"{name}: prior.like = {like!r}: must be a parameter of the same constant")
@@ -302,4 +307,6 @@ class StudyContent(Section, ABC):
                 f"{name}: prior.like = {like!r}: is itself centred on another parameter; name that parameter"
             )
         if not other.bounds[0] > 0:
-            raise InputError(f"{name}: prior.like = {like!r}: its lower bound must be greater than 0")
+            raise InputError(
+                f"{name}: prior.like = {like!r}: the lower bound of this parameter must be greater than 0"
+            )

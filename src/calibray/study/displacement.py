@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 
 
 RECEIVER: Final = "rx:"
-"""Prefix of the names of receivers' parameters."""
+"""Prefix of the names of receiver parameters."""
 
 AXES: Final = {"dx": 0, "dy": 1, "height": 2}
 """Index of the coordinate (x, y, z) that each field changes."""
 
 LEAST: Final = 0.01
-"""Smallest displacement of the outermost knot [m]; it keeps knots distinct if a value is at its bound."""
+"""Minimum displacement of the outermost knot [m]; it keeps knots distinct if a parameter is at its bound."""
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
-"""Displacements on each side that are traced before the calibration, as shares of the largest displacement. For panels
-of eight rows and traced heights 2 m apart, the error of the interpolated path loss is 0.1 dB (median) and 2 dB (RMS).
-With a parabola through the stated height and bounds 8 m above and below it, the RMS error is 5 dB."""
+"""Displacements traced on each side before the calibration, as fractions of the largest displacement. For antenna
+panels of eight rows, traced at heights 2 m apart, the error of the interpolated path loss is 0.1 dB (median) and 2 dB
+(RMS). With a parabola through the stated height and the bounds 8 m above and below, the RMS error is 5 dB."""
 
 
 def displaces(name: str) -> bool:
@@ -58,7 +58,7 @@ class Displacement:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
         weights: 1 if a parameter displaces a group of links, otherwise 0 [G, parameters].
         group: Group of every link [L].
-        reach: Largest displacement of every group that a single parameter can cause [G], [m]; the sum over parameters
+        reach: Largest displacement that a single parameter can cause in each group [G], [m]. The sum over parameters
             has the same limit.
         ground: The ground above which receivers keep their height; None if heights are not measured from the ground.
     """
@@ -70,7 +70,7 @@ class Displacement:
     ground: Ground | None = None
 
     def moved(self, links: Measurements, displacement: NDArray[np.float64]) -> Measurements:
-        """The links with ends displaced by `displacement` [L], [m]."""
+        """The links with one end displaced by `displacement` [L], [m]."""
         end = "tx" if self.field == "height" else "rx"
         stated = getattr(links, end)
         position = np.array(stated)
@@ -84,12 +84,12 @@ class Displacement:
 
         Args:
             values: Values of the parameters [d] at which the displacement is 0.
-            neighbours: Displacements on each side, as shares of the largest displacement. Near a bound, they are
-                limited to equidistant positions up to the bound.
+            neighbours: Displacements on each side, as fractions of the largest displacement. Near a bound, these
+                displacements are limited to equidistant positions up to the bound.
         """
         shares = np.array(neighbours)
         equidistant = np.arange(1, len(shares) + 1) / max(len(shares), 1)
-        # Links are displaced by sums of parameters; `room` is the distance from the present sum to the bounds.
+        # The displacement of a link is a sum of parameters; `room` is the distance from the present sum to a bound.
         present, knots = self.weights @ values, [np.zeros((1, len(self.reach)))]
         for side in (1, -1):
             room = np.maximum(self.reach - side * present, LEAST)
@@ -100,7 +100,7 @@ class Displacement:
 
 
 def follow(ground: Ground | None, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
-    """Keep the height of displaced positions [n, 3], [m], above the ground. Without ground, z is unchanged."""
+    """Keep the height above ground of displaced positions [n, 3], [m]. Without `ground`, z is unchanged."""
     if ground is None:
         return
     with np.errstate(invalid="ignore"):  # inf - inf where there is no ground
@@ -116,8 +116,8 @@ def displacements(
 ) -> tuple[Displacement, ...]:
     """One `Displacement` for each axis along which parameters displace links.
 
-    Receivers of links without measured values have exact positions and are not displaced. `columns` contains the names
-    of the columns of transmitters ("tx:") and devices ("rx:").
+    Receivers of links without measured values have exact positions and are not displaced. `columns` names the columns
+    that contain the transmitters ("tx:") and the devices ("rx:").
 
     Raises:
         InputError: A column is missing.
@@ -147,7 +147,7 @@ def displacements(
 def check_labels(
     source: str, names: Mapping[str, object], links: Measurements, kind: str, column: str | None
 ) -> None:
-    """Check that links have the transmitters ("tx:") or devices ("rx:") to which parameters refer.
+    """Check that the transmitters ("tx:") or devices ("rx:") to which parameters refer occur in the links.
 
     Raises:
         InputError: A transmitter or device is unknown, or the column of names is missing.
@@ -180,11 +180,12 @@ def displacement_loss(
     Args:
         displacements: The K displacements.
         placed: The parameters of the study, and the parameter values at which the paths are traced [d].
-        neighbours: Distances of the n neighbours on each side, as ascending shares of the largest displacement.
-        links: The L links at these values.
-        here: The paths of these links, and other effects on the paths.
-        traced: Function that returns the paths of displaced links, and effects on the paths. The number of these links
-            can differ from L.
+        neighbours: Distances to the n neighbouring positions on each side, as fractions of the largest displacement, in
+            ascending order.
+        links: The L links at the positions that these values determine.
+        here: The paths of these links, and the other effects on these paths.
+        traced: Function that returns the paths of displaced links and the effects on these paths. The number of
+            displaced links can differ from L.
     """
     # JAX is slow to import, and this module is imported whenever a study file is read.
     from calibray.engines.replay import Computation, Replay
@@ -199,7 +200,7 @@ def displacement_loss(
 
     knots = np.array([each.knots(values, neighbours) for each in displacements])  # [K, 2n + 1, L]
     change_db = np.zeros(knots.shape)
-    # A link is not traced again at its own position, where its change is zero.
+    # A link is not traced again at its undisplaced position, where the change in path loss is zero.
     moved = (knots != 0) & np.array([each.reach[each.group] > 0 for each in displacements])[:, None]
     if moved.any():
         axis, _, link = np.nonzero(moved)
@@ -231,7 +232,7 @@ def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
 
 
 def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes in path loss [K, 2n + 1, L], [dB]; where no path arrives, the change at the next position inwards."""
+    """Changes in path loss [K, 2n + 1, L], [dB]. Where no path arrives, the next position inwards gives the change."""
     change_db, middle = change_db.copy(), change_db.shape[1] // 2
     for step in range(1, middle + 1):
         for side in (1, -1):
@@ -246,7 +247,7 @@ def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArra
     The cubics do not overshoot where paths appear or vanish between two positions (Fritsch and Carlson 1980).
     """
     coefficients = np.empty((4, len(knots) - 1, knots.shape[1]))
-    # SciPy needs the same knots for all columns; the links of a group have the same knots.
+    # SciPy requires the same knots for all columns, so links with the same knots are interpolated together.
     distinct, group = np.unique(knots, axis=1, return_inverse=True)
     for number, column in enumerate(distinct.T):
         links = group.reshape(-1) == number
@@ -262,7 +263,7 @@ Gaussian error up to cubic terms (Stroud's spherical rule of degree three in the
 def displaced(
     links: Measurements, error_m: NDArray[np.float64], ground: Ground | None = None
 ) -> Measurements:
-    """Links to displaced receivers, ordered by direction; `error_m` is the standard deviation of the error [L], [m].
+    """Links to displaced receivers, ordered by direction; `error_m` is the standard deviation of positions [L], [m].
 
     With a `ground`, receivers keep their height above the ground.
     """
@@ -275,7 +276,7 @@ def displaced(
 
 
 def averaged(paths: Paths, links: Measurements) -> Paths:
-    """Assign the paths of displaced receivers to the original links; the sum of powers is the mean over the receivers.
+    """Assign the paths of displaced receivers to the original links; the power of a link is the mean over receivers.
 
     Displaced receivers without a path are excluded from the mean.
     """
@@ -284,7 +285,7 @@ def averaged(paths: Paths, links: Measurements) -> Paths:
     parts = []
     for direction in range(directions):
         part = take_links(paths, np.arange(count) + direction * count)
-        # The square root, because `spreading` is an amplitude and powers are divided by the number of receivers.
+        # `spreading` is an amplitude, so dividing it by a square root divides powers by the number of receivers.
         spreading = part.spreading / np.sqrt(reached.sum(axis=0)[part.link])
         parts.append(replace(part, spreading=spreading, tx_position=links.tx, rx_position=links.rx))
     return concatenate(parts)

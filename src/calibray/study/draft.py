@@ -1,4 +1,4 @@
-"""Drafts a study from a scene and a table of links: TOML with the reason for every assumption as a comment.
+"""Drafts a study from a scene and a table of links. The draft is TOML; comments state the reason for each assumption.
 
 Names of columns, groups and files are user input. `study_text` quotes them, so none is interpreted as TOML.
 """
@@ -45,25 +45,25 @@ AVERAGING_WAVELENGTHS: Final = 40
 """Width of the cells over which fading is averaged [wavelengths] (Lee 1985; see `calibray.measurements.reading`)."""
 
 PLACE_SAMPLES: Final = 20
-"""Smallest median number of samples per position for which samples are averaged by position, as in a stationary scan.
+"""Minimum median number of samples per position for averaging by position, as in a stationary scan.
 The logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
-"""Smallest share of values equal to the lowest one at which clipping by the receiver is assumed."""
+"""Minimum share of values equal to the lowest value at which clipping by the receiver is assumed."""
 
 CLIPPED_RATIO: Final = 10
-"""Smallest ratio of the lowest value's count to the other values' median count at which clipping is assumed."""
+"""Minimum ratio of the count of the lowest value to the median count of other values at which clipping is assumed."""
 
 MISSING_SHARE: Final = 0.1
 """Share of missing powers of a device above which the lowest power of the device is used as its noise floor."""
 
 FEWEST_OF_DEVICE: Final = 20
-"""Smallest number of measured powers from which the noise floor of a device is inferred. The lowest of 20 powers is in
-the lowest tenth in 88 % of cases."""
+"""Minimum number of measured powers from which the noise floor of a device is inferred. The lowest of 20 powers is in
+the lowest tenth of the distribution in 88 % of cases."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
-    """Draft ``[links]``; the arguments are those of `LinksDraft`.
+    """Draft ``[links]``. The arguments are those of `LinksDraft`.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
@@ -103,7 +103,7 @@ def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
     power = column_names.find_transmit_power(draft.table.frame)
     if power is not None:
         return {"eirp_dbm" if column_names.matches(power, "EIRP") else "tx_power_dbm": power}
-    # A reference signal has the power of one subcarrier; tables of transmitters state the power of the whole carrier.
+    # A reference signal has the power of one subcarrier; a table of transmitters states the power of the whole carrier.
     if draft.sites is None or column_names.matches(value.column, "reference signal"):
         return {}
     return find_powers(draft.transmitter_rows)
@@ -112,7 +112,9 @@ def _powers(draft: LinksDraft, value: ValueColumn) -> dict[str, str]:
 def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
     """The columns whose labels define the groups of the offset."""
     if value.quantity != "rsrp":
-        draft.assume("offset", "one for all links", "values include cable losses and unknown antenna gains")
+        draft.assume(
+            "offset", "one for all links", "the values include cable losses and unknown antenna gains"
+        )
         return []
     name = draft.section.get("transmitter")
     devices = transmitter_columns.find_devices(draft.table.frame)
@@ -122,9 +124,9 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
         *(["each receiver"] if devices else []),
         *(["each carrier"] if carriers else []),
     ]
-    reasons = [] if devices else ["no column of devices was found"]
+    reasons = [] if devices else ["no column of receiving devices was found"]
     if ends:
-        reasons.append(f"{' and '.join(ends)} has a different gain")
+        reasons.append(f"{' and '.join(ends)} has its own gain")
     groups = [*([name] if name else []), *devices, *carriers]
     groups = list(dict.fromkeys(groups))
     draft.assume("offset.per", ", ".join(groups) or "one", "; ".join(reasons))
@@ -156,10 +158,10 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
     floor, reason, share = -np.inf, "", _share_at_lowest(column)
     some_missing = share == 0 and "wide" not in draft.section and column.isna().any()
     if share > 0:
-        floor, reason = float(column.min()), f"{100 * share:.0f} % of the values equal the lowest one"
+        floor, reason = float(column.min()), f"{100 * share:.0f} % of the values equal the lowest value"
     elif some_missing:
-        floor, reason = float(np.floor(column.min())), f"{missing}, and none is lower"
-    # The floor is that of the least sensitive device; powers that it misses can be above the floors of others.
+        floor, reason = float(np.floor(column.min())), f"{missing}, and no measured value is lower"
+    # The noise floor is that of the least sensitive device, which misses powers that other devices can measure.
     for name in transmitter_columns.find_devices(draft.table.frame):
         for device, values in column.groupby(draft.table.frame[name]):
             if values.notna().sum() < FEWEST_OF_DEVICE:
@@ -168,11 +170,12 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
             if (share := _share_at_lowest(values)) and lowest > floor:
                 floor = lowest
                 reason = (
-                    f"{100 * share:.0f} % of the values of {which}, the least sensitive, equal its lowest one"
+                    f"{100 * share:.0f} % of the values of {which}, the least sensitive device, equal its lowest "
+                    "value"
                 )
             elif some_missing and values.isna().mean() > MISSING_SHARE and np.floor(lowest) > floor:
                 floor = float(np.floor(lowest))
-                reason = f"{missing}, and none of {which}, the least sensitive, is lower"
+                reason = f"{missing}, and no value of {which}, the least sensitive device, is lower"
     if not reason:
         return
     draft.section["noise_floor_dbm"] = floor
@@ -180,17 +183,17 @@ def _add_noise_floor(draft: LinksDraft, value: ValueColumn) -> None:
 
 
 def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Series) -> None:
-    """Leave out rows with the largest power, which a saturated receiver reports for all larger powers."""
+    """Leave out rows with the highest power, which a saturated receiver reports for all higher powers."""
     share = _share_at_lowest(-column)
     if share > 0:
         name, highest = value.column, float(column.max())
         draft.add_filter(f"(`{name}` < {highest} or `{name}`.isna())")
-        reason = f"{100 * share:.0f} % of the values equal the highest one: the receiver is saturated"
+        reason = f"{100 * share:.0f} % of the values equal the highest value: the receiver is saturated"
         draft.assume("links.where", draft.section["where"], reason)
 
 
 def _share_at_lowest(values: pd.Series) -> float:
-    """Share of values equal to the lowest one if a receiver seems to report it for all lower powers; otherwise 0."""
+    """Share of values equal to the lowest value, if a receiver seems to report it for all lower powers; otherwise 0."""
     counts = values.value_counts().sort_index()
     share = counts.iloc[0] / counts.sum()
     if share >= CLIPPED_SHARE and counts.iloc[0] >= CLIPPED_RATIO * counts.iloc[1:].median():
@@ -199,7 +202,7 @@ def _share_at_lowest(values: pd.Series) -> float:
 
 
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
-    """Average samples of stationary scans or height profiles by position, and other dense samples in cells."""
+    """Average samples by position in stationary scans and height profiles, and in cells if other samples are dense."""
     frame, name = draft.table.frame, draft.section.get("transmitter")
     heights = [] if rx.height is None else [rx.height]
     keys = [rx.x, rx.y, *heights, *draft.groups, *([name] if name and name not in draft.groups else [])]
@@ -210,7 +213,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
         return
     rows = f"{len(frame)} rows " + ("along a track" if draft.given.track else f"at {positions} positions")
     samples = int(frame.groupby(keys, dropna=False).size().median())
-    # A cell is an area in plan, so it would average over the heights of a profile or of several storeys.
+    # A cell is an area in plan, so averages in cells would mix the heights of a profile or of several storeys.
     stacked = any(frame.groupby([rx.x, rx.y])[height].nunique().median() > 1 for height in heights)
     if draft.given.track is None and (samples >= PLACE_SAMPLES or stacked):
         few = samples < PLACE_SAMPLES
@@ -228,7 +231,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
 
 
 def _add_observables(draft: LinksDraft) -> None:
-    # A row of a wide table has the powers of several transmitters, but only one flight time or delay spread.
+    # A row of a wide table contains the powers of several transmitters, but only one flight time or delay spread.
     if "wide" in draft.section:
         return
     if (delay_spread := column_names.find_delay_spread(draft.table.frame)) is not None:
@@ -257,10 +260,10 @@ def _add_observables(draft: LinksDraft) -> None:
 
 
 MOST_MATERIALS: Final = 6
-"""Largest number of materials that a draft calibrates; links seldom identify more."""
+"""Maximum number of materials that a draft calibrates; links seldom determine more materials."""
 
 INDOOR_DEPTHS: Final = (3, 5)
-"""Smallest and largest number of interactions of an indoor study."""
+"""Minimum and maximum number of interactions along a path in an indoor study."""
 
 
 @dataclass(frozen=True)
@@ -279,10 +282,10 @@ class Draft:
 
 
 def draft(scene: str, links: str | Path, target: str | Path, given: Given | None = None) -> Draft:
-    """Draft a study from a scene (XML file or `sionna:NAME`) and a table of links, without writing files.
+    """Draft a study from a scene (XML file or `sionna:NAME`) and a table of links; no file is written.
 
-    File names in the study are relative to the folder of `target`, the future study file. `given` contains further
-    input of the user.
+    File names in the study are relative to the folder of `target`, the future study file. `given` contains further user
+    input.
 
     Raises:
         InputError: A file cannot be read, or a value is neither given nor in the files.
@@ -301,13 +304,13 @@ def _content(links: LinksDraft) -> dict[str, Any]:
     indoors = _indoors(links)
     if section.get("position") == "geographic" and not indoors:
         section["inside"] = "move"
-        reason = "satellite positions have errors of metres, and some are inside buildings"
+        reason = "satellite positions have errors of metres, and some positions are inside buildings"
         # Powers at displaced receivers can be averaged only at one carrier.
-        reason += "" if "frequency" in section else "; position_error_m models them"
+        reason += "" if "frequency" in section else "; position_error_m models these errors"
         links.assume("links.inside", "move", reason)
     antenna_section = add_antennas(links)
     trace: dict[str, Any] = {"max_depth": _depth(links) if indoors else 3, "samples": "auto"}
-    # Behind buildings, most links have only diffracted paths.
+    # Most links behind buildings have only diffracted paths.
     trace["refraction" if indoors else "diffraction"] = True
     scene, constants = _scene(links)
     regions, attenuation = _trees(links)
@@ -334,12 +337,15 @@ def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
     if count_unknowns(study, measured) or places < DEFAULT_BLOCKS * LINKS_PER_UNKNOWN:
         return
     content["holdout"] = {"blocks": DEFAULT_BLOCKS}
-    reason = "each block of neighbouring links is predicted from the others; the errors determine the prediction model"
+    reason = (
+        "each block of neighbouring links is predicted from the others; the prediction errors determine the prediction "
+        "model"
+    )
     links.assume("holdout.blocks", DEFAULT_BLOCKS, reason)
 
 
 def _indoors(links: LinksDraft) -> bool:
-    """Whether most receivers are below a ceiling."""
+    """Whether most receivers are below a ceiling or roof."""
     share = float(links.overhead.under_roof(links.measurements().rx).mean())
     indoors = share > 0.5
     reason = f"{100 * share:.0f} % of the receivers are below a ceiling or roof"
@@ -348,22 +354,20 @@ def _indoors(links: LinksDraft) -> bool:
 
 
 def _depth(links: LinksDraft) -> int:
-    """Largest number of interactions: walls on a straight line (95 % quantile) plus two, within `INDOOR_DEPTHS`."""
+    """Maximum number of interactions: walls on a straight line (95 % quantile) plus two, within `INDOOR_DEPTHS`."""
     measured = links.measurements()
     walls = int(np.quantile(count_crossings(links.overhead.walls, measured.tx, measured.rx), 0.95))
     lowest, highest = INDOOR_DEPTHS
     depth = int(np.clip(walls + 2, lowest, highest))
-    reason = (
-        f"straight lines cross up to {walls} walls; plus two reflections, limited to {lowest} to {highest}"
-    )
+    reason = f"walls on a straight line ({walls}) plus two reflections, limited to {lowest} to {highest}"
     links.assume("trace.max_depth", depth, reason)
     return depth
 
 
 def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
-    """The scene, and the constants of materials without an ITU-R P.2040 law at the carrier.
+    """The scene, and the constants of materials for which ITU-R P.2040 has no law at the carrier.
 
-    These constants are computed from the law of the material at the nearest frequency that the law covers.
+    These constants are those of the material at the nearest frequency that its law covers.
     """
     try:
         return read_scene(links.scene, links.frequency), {}
@@ -377,15 +381,18 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
         if nearest != links.frequency / 1e9:
             permittivity, conductivity = law.a * nearest**law.b, law.c * nearest**law.d
             constants[name] = {"relative_permittivity": permittivity, "conductivity": conductivity}
-    reason = f"ITU-R P.2040 does not cover {links.frequency / 1e9:g} GHz: constants at the nearest frequency covered"
+    reason = (
+        f"ITU-R P.2040 does not cover {links.frequency / 1e9:g} GHz: the constants are those at the nearest frequency "
+        "covered"
+    )
     links.assume("materials", ", ".join(constants), reason)
     return read_scene(links.scene, links.frequency, constants), constants
 
 
 def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The region of trees from the file next to the scene, and its parameter if a link's straight line crosses it."""
+    """The region of trees from the file next to the scene, and its parameter if a straight line crosses the region."""
     file = Path(links.scene).parent / TREES_FILE
-    # Next to other scenes, a file of this name need not have the columns that `calibray scene` writes.
+    # For other scenes, a file of this name need not contain the columns that `calibray scene` writes.
     if links.scene.startswith(BUNDLED) or read_frame(links.scene) is None or not exists(file):
         return {}, {}
     specific = round(dense_trees(links.frequency), 2)
@@ -394,7 +401,10 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
     section = RegionSection.model_validate_json(json.dumps(content))
     region, measured = section.region(file, Place(links.frame, lambda: links.overhead)), links.measurements()
     crossing = int((region.length_inside(measured.tx, measured.rx) > 0).sum())
-    reason = f"trees on the straight lines of {crossing} of {len(measured)} links; typical value of dense trees in leaf"
+    reason = (
+        f"the straight lines of {crossing} of {len(measured)} links cross trees; the value is typical of dense trees "
+        "in leaf"
+    )
     links.assume("regions", f"trees, {specific:g} dB/m", reason)
     parameter = {"region:trees.specific_attenuation": {"bounds": [0.0, 3.0]}} if crossing else {}
     return {"trees": content}, parameter
@@ -405,7 +415,9 @@ def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dic
     bounds_of = permittivity_bounds(scene.materials)
     names, rest = list(bounds_of)[:MOST_MATERIALS], list(bounds_of)[MOST_MATERIALS:]
     if not names:
-        raise InputError(f"{links.scene}: no material to calibrate; all materials are metal or air")
+        raise InputError(
+            f"{links.scene}: there is no material to calibrate, because all materials are metal or air"
+        )
     entries: dict[str, dict[str, Any]] = {}
     for name in names:
         conductivity = scene.materials[name].conductivity
@@ -445,13 +457,13 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
     for key, column in transmitter_columns.find_angles(frame, of_transmitters).items():
         electrical = folder is not None and key.startswith("electrical")
         if electrical and tilted and not matches(column, "additional"):
-            cause = "it is included in the vertical cuts of the files"
+            cause = "the vertical cuts of the files include this downtilt"
         else:
             lacking = transmitter_columns.lacks_angle(frame[column], may_be_empty=omnidirectional)
             if folder is not None and lacking.any() and frame[column].notna().any():
                 raise InputError(
-                    f"{_cells(links, column, lacking)} contains no number; write the angle [deg]; only cells of "
-                    "omnidirectional antennas can be empty"
+                    f"{_cells(links, column, lacking)} contains no number; enter the angle [deg]; only cells of "
+                    "omnidirectional antennas may be empty"
                 )
             cause = transmitter_columns.unusable(frame, key, column, lacking)
         if cause:
@@ -475,7 +487,8 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         name for name in links.table.frame if matches(name, "receiver") and matches(name, "azimuth")
     ):
         reason = (
-            f"column {column} may describe a phone; if the antenna is directional, state column and pattern"
+            f"column {column} may describe the azimuth of a phone; if the antenna is directional, state this column "
+            "and the pattern"
         )
         links.assume("links.rx_antenna.azimuth_deg", "none", reason)
     name = transmitter_columns.find_antenna_names(frame) if of_transmitters else None
@@ -496,9 +509,9 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
 def _patterns(
     links: LinksDraft, folder: Path, mount: dict[str, str]
 ) -> tuple[dict[str, Any], NDArray[np.bool_], list[Path]]:
-    """The antennas named in a column of the transmitters, which rows have an omnidirectional one, and their files.
+    """The antennas named in a column of the transmitters, the rows with omnidirectional antennas, and the files.
 
-    A name is that of a file in the folder or of a pattern of Sionna RT. A single file is used for all transmitters.
+    Each name is that of a file in the folder or of a Sionna RT pattern. A single file is used for all transmitters.
 
     Raises:
         InputError: The folder cannot be used, or an antenna is not named or has no file.
@@ -510,7 +523,7 @@ def _patterns(
         raise InputError(f"--antennas {folder}: cannot be read ({error}); give a folder") from None
     if not files:
         raise InputError(
-            f"--antennas {folder}: contains no file *.msi, *.pln or *.ant; export the antennas to this folder"
+            f"--antennas {folder}: contains no *.msi, *.pln or *.ant file; export the antennas to this folder"
         )
     by_name = {plain_name(file.name): file for file in files}
     column = transmitter_columns.find_antenna_names(rows, by_name)
@@ -545,13 +558,13 @@ def _patterns(
 
 
 def _cells(links: LinksDraft, column: str, rows: NDArray[np.bool_]) -> str:
-    """The file, column and rows of cells of the transmitters, formatted for messages."""
+    """The file, column and rows of table cells of the transmitters, formatted for messages."""
     table = links.transmitter_table
     return f"{table.source}: column {column!r} in {rows_text(table.row[rows].tolist())}"
 
 
 def _antenna(links: LinksDraft, pattern: Path | str) -> dict[str, str]:
-    """An antenna with a pattern of Sionna RT or the pattern of a file; the file must be readable."""
+    """An antenna with a Sionna RT pattern or the pattern in a file. The file must be readable."""
     if isinstance(pattern, Path):
         read_gain_table(pattern)
         pattern = links.relative(pattern)
@@ -564,7 +577,7 @@ def schema_text() -> str:
 
 
 def schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of a study; the first paragraph of each docstring is a description."""
+    """The JSON Schema (draft 2020-12) of a study. Descriptions are the first paragraphs of docstrings."""
     content = Study.model_json_schema()
     _shorten(content)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Calibray study"} | {
@@ -573,7 +586,7 @@ def schema() -> dict[str, Any]:
 
 
 def _shorten(node: Any) -> None:
-    """Keep only the first paragraph of each description; the others describe attributes of Python classes."""
+    """Keep only the first paragraph of each description; the other paragraphs describe attributes of Python classes."""
     if isinstance(node, dict):
         if isinstance(node.get("description"), str):
             node["description"] = node["description"].split("\n\n")[0].replace("\n", " ").replace("``", "")

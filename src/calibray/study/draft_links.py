@@ -41,18 +41,18 @@ from calibray.support.messages import counted, shortened
 _LOG: Final = logging.getLogger(__name__)
 
 RECEIVER_HEIGHT: Final = 1.5
-"""Default height of a receiver without a column of heights [m], for a handheld phone."""
+"""Default height [m] of a receiver if there is no column of heights; the value applies to a handheld phone."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn", "msnm"})
-"""Words in the names of altitude columns. These are ambiguous: satellite receivers report altitudes above sea level,
+"""Words in the names of altitude columns. Their meaning varies: satellite receivers report altitudes above sea level,
 and drones also report altitudes above ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
-"""Default height of a transmitter without a column of heights [m], for a small cell on a mast."""
+"""Default height [m] of a transmitter if there is no column of heights; the value applies to a small cell on a mast."""
 
 SAME_CARRIER: Final = 0.01
-"""Largest relative difference between carriers that are treated as one carrier. This difference changes free-space loss
-by 0.09 dB."""
+"""Maximum relative difference between frequencies that count as one carrier. This difference changes free-space loss by
+0.09 dB."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Assumption:
     Attributes:
         what: Key of the study to which the assumption applies.
         value: The assumed value.
-        reason: Why this value is assumed.
+        reason: The reason for the assumption.
     """
 
     what: str
@@ -72,12 +72,12 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Given:
-    """What the user states in addition to the scene and the table of links.
+    """User input other than the scene and the table of links.
 
     Attributes:
         transmitters: Table of the transmitters' positions, unless the table of links contains them.
         track: GPX track with the positions of the rows, unless the table of links contains them.
-        antennas: Folder of MSI files named after the transmitters' antennas.
+        antennas: Folder of MSI files, each named after an antenna of the transmitters.
         tx: Transmitter position (x, y, z) [m] in the scene frame, unless a table contains it.
         frequency: Carrier frequency [Hz], unless a table contains it.
         origin: Longitude and latitude of the scene's origin [deg], unless the scene file contains them.
@@ -99,12 +99,12 @@ class LinksDraft:
         scene: Mitsuba XML file, or `sionna:NAME`.
         links: File of the table of links.
         target: The future study file.
-        given: What the user states.
+        given: Further user input.
         section: The keys of ``[links]``.
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
-        table: The table of links, without the rows left out so far.
-        sites: The table of transmitters, limited to those of the links; None without such a table.
+        table: The table of links, without the rows that have been left out.
+        sites: The table of transmitters, limited to those in the links; None if there is no such table.
         rx: Columns of the receivers' positions.
         tx: Columns of the transmitters' positions; None if there are no such columns.
         groups: The columns whose labels define the groups of the offset.
@@ -151,7 +151,7 @@ class LinksDraft:
 
     @property
     def transmitter_table(self) -> SourceTable:
-        """The table of transmitters, with columns renamed as in the links. Without such a table, the table of links."""
+        """The table of transmitters, with columns renamed as in the links; the table of links if there is none."""
         if self.sites is None:
             return self.table
         return replace(self.sites, frame=self.sites.frame.rename(columns=self._name_in_links))
@@ -171,12 +171,12 @@ class LinksDraft:
             self.assumptions[self.assumptions.index(earlier)] = merged
 
     def measurements(self) -> Measurements:
-        """The links, read with the keys drafted so far."""
+        """The links, as read with the keys already drafted."""
         content = {
             "version": VERSION,
             "scene": self.scene_section | {"frequency": 1e9},
             "links": self.section,
-            # Neither the carrier nor the parameters affect positions, but a study needs both.
+            # The carrier and the parameters do not affect positions, but a study needs both.
             "parameters": {"any.relative_permittivity": {"bounds": [1.5, 12.0]}},
             "offset": {},
         }
@@ -190,13 +190,13 @@ class LinksDraft:
         return ", ".join(map(str, self.table.frame))
 
     def _add_track(self) -> None:
-        """Give each row the position on the track at its time."""
+        """Give each row the track position at the time of the row."""
         if self.given.track is None:
             return
         name = column_names.find_time(self.table.frame)
         if name is None:
             raise InputError(
-                f"{self.links}: no column of times ({self._columns()}), but {self.given.track} gives positions by "
+                f"{self.links}: no column of times ({self._columns()}), but {self.given.track} states positions by "
                 "time; name the column of times 'time'"
             )
         self.section["track"] = {"file": self.relative(self.given.track), "time": name}
@@ -204,11 +204,11 @@ class LinksDraft:
         self.table = select_rows(self.table, Preparation(track=Track(str(self.given.track), name)))
         reason = f"given; it covers {len(self.table)} of {rows} rows"
         if not re.search(r"(Z|[+-]\d\d(:?\d\d)?|^[\d.]+)$", str(self.table.frame[name].iloc[0])):
-            reason += "; times without a time zone are read as UTC"
+            reason += "; times without a time zone are taken as UTC"
         self.assume("links.track", f"{self.given.track.name} by {name}", reason)
 
     def _add_transmitters(self) -> None:
-        """Match the rows with the table of transmitters, by a common column or by the columns of a wide table."""
+        """Match the rows to the table of transmitters, by a common column or by the columns of a wide table."""
         if self.sites is None or self.given.transmitters is None:
             return
         self.section["transmitters"] = self.relative(self.given.transmitters)
@@ -217,8 +217,8 @@ class LinksDraft:
         key = key if shared is None else (shared, shared)
         if key is not None:
             name, of_table = key
-            reason = f"its values are in column {of_table} of {self.given.transmitters.name}"
-            reason = reason if shared is None else "both tables have this column, with common values"
+            reason = f"the values also occur in column {of_table} of {self.given.transmitters.name}"
+            reason = reason if shared is None else "both tables contain this column and share values in it"
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, reason)
             self._leave_out_unknown_transmitters(name, self.sites.frame[of_table])
@@ -231,7 +231,7 @@ class LinksDraft:
         name, columns = max(wide.items(), key=lambda item: len(item[1]))
         if not columns:
             raise InputError(
-                f"{self.links}: no column contains the transmitters of the rows, and no columns have the names of the "
+                f"{self.links}: no column names the transmitters of the rows, and no columns are named after the "
                 f"transmitters in {self.given.transmitters}; give both tables a column with the same name"
             )
         self.section |= {"wide": columns, "transmitter": name}
@@ -249,7 +249,7 @@ class LinksDraft:
     def _keep_used_transmitters(self, key: str, names: Iterable[object]) -> None:
         """Keep only the transmitters of the links.
 
-        A network's table also contains other transmitters, with different antennas.
+        The table of a network also contains other transmitters, whose antennas can differ.
         """
         if self.sites is not None:
             compared = comparison(self.sites.frame[key])
@@ -262,7 +262,7 @@ class LinksDraft:
         if not lacking.any():
             return
         names = column[lacking].dropna().unique().tolist()
-        # The filter lists the known names, so rows without a name are left out too.
+        # The filter lists the known names, so it also excludes rows without a name.
         self.add_filter(f"`{key}` in {column[~lacking].unique().tolist()}")
         named = ", ".join(map(str, names[:10])) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
         source = (
@@ -272,12 +272,12 @@ class LinksDraft:
         if names:
             counts = [f"{name} ({counted(int((column == name).sum()), 'row')})" for name in names]
             _LOG.warning(
-                "%s: %s lacks %s; these rows are left out; add these transmitters to keep them",
+                "%s: %s lacks %s; the rows of these transmitters are left out; to keep the rows, add the transmitters",
                 self.links, source, shortened(", ".join(counts), 300),
             )  # fmt: skip
 
     def _leave_out_unplaced_receivers(self) -> None:
-        """Draft a filter that excludes rows without a receiver position, such as rows without a satellite fix."""
+        """Draft a filter that excludes rows without a receiver position, for example without a satellite fix."""
         names = [name for name in (self.rx.x, self.rx.y, self.rx.height) if name is not None]
         missing = self.table.frame[names].isna()
         lacking = missing.any(axis=1).to_numpy()
@@ -295,23 +295,23 @@ class LinksDraft:
         self.table = self.table.select(~rows)
 
     def add_filter(self, condition: str) -> None:
-        """Add a condition to the row filter; a condition with `or` must be in parentheses."""
+        """Add a condition to the row filter. A condition that contains `or` must be in parentheses."""
         where = self.section.get("where")
         self.section["where"] = condition if where is None else f"{where} and {condition}"
 
     def assume_codes(self, codes: Sequence[float], columns: str) -> None:
-        """Record numbers that represent missing measurements."""
+        """Record numbers that stand for missing measurements."""
         if codes:
             self.section["missing"] = list(codes)
             listed = ", ".join(f"{code:g}" for code in codes)
             self.assume(
                 "links.missing",
                 listed,
-                f"far from all other values of {columns}, therefore treated as missing",
+                f"far from all other values of {columns} and therefore treated as missing",
             )
 
     def _frequency(self) -> float:
-        """The carrier of the study, given by the user or stated in a column of the links or the transmitters."""
+        """The carrier of the study, given by the user or stated in a column of the links or of the transmitters."""
         given, stated = self.given.frequency, self._stated_frequency()
         if given is not None:
             differs = stated is not None and abs(stated[0] - given) >= SAME_CARRIER * given
@@ -329,7 +329,7 @@ class LinksDraft:
         return stated[0]
 
     def _frequency_tables(self) -> list[tuple[Path, pd.DataFrame]]:
-        """The tables that can state carriers, by file, in the order of their priority."""
+        """The tables that can state carriers, each with its file, in order of priority."""
         sites = self.given.transmitters
         return [(self.links, self.table.frame), *([(sites, self.transmitter_rows)] if sites else [])]
 
@@ -344,22 +344,22 @@ class LinksDraft:
         if carriers[-1] - carriers[0] < SAME_CARRIER * carriers[0]:
             return float(np.nanmedian(values)), f"median of column {name}"
         read = rows[name].to_numpy(dtype=float) * column_names.find_frequency_unit(name)
-        # The name of the column states the unit of `links.frequency`; a study has no key for a guessed unit.
+        # The column name must state the unit of `links.frequency`, because a study has no key for a guessed unit.
         if np.array_equal(read, values, equal_nan=True) and len(carriers) <= MAX_CARRIERS:
             self.section["frequency"] = name
             self.assume("links.frequency", name, f"{len(carriers)} carriers in {file.name}")
-            # The tracer samples paths through walls at this carrier, at which walls are most transparent.
+            # The tracer samples paths through walls at the lowest carrier, because walls are most transparent there.
             return float(carriers[0]), f"lowest carrier of column {name}"
         if self.given.frequency is None:
             raise InputError(
-                f"{file}: column {name!r} has {len(carriers)} carriers; a study reads at most {MAX_CARRIERS}, in Hz or "
-                "in the unit that the column's name states, such as frequency_mhz; otherwise, give --frequency and a "
-                "table with one carrier"
+                f"{file}: column {name!r} has {len(carriers)} carriers; a study can have at most {MAX_CARRIERS} "
+                "carriers, in Hz or in the unit that the column's name states, such as frequency_mhz; otherwise, give "
+                "--frequency and a table with one carrier"
             )
         return float(np.nanmedian(values)), f"median of column {name}"
 
     def _position_columns(self) -> tuple[PositionColumns, PositionColumns | None]:
-        """Columns of receiver and transmitter positions; None for the transmitters if there are no such columns."""
+        """Columns of receiver and transmitter positions; None for the transmitters if the tables lack such columns."""
         if self.given.track is None:
             rx = column_names.find_position(self.table.frame, "rx", unnamed=True)
         else:
@@ -392,14 +392,14 @@ class LinksDraft:
     def _projected(
         self, rx: PositionColumns, tx: PositionColumns | None
     ) -> tuple[PositionColumns, PositionColumns | None]:
-        """The columns, read as degrees or projected coordinates if this places most positions on the scene."""
+        """The columns, treated as degrees or projected coordinates if most positions then lie on the scene."""
         frame = self.frame if rx.position == "scene" else None
         if frame is None or (tx is not None and tx.position != "scene"):
             return rx, tx
         placed = self.table.frame[[rx.x, rx.y]].dropna().astype(float)
         x, y = placed[rx.x], placed[rx.y]
         low, high = self.overhead.bounds[:2], self.overhead.bounds[3:5]
-        # Exports of geodata may call longitude and latitude x and y.
+        # Exported geodata may use the names x and y for longitude and latitude.
         if x.abs().max() <= 180 and y.abs().max() <= 90:
             on_scene = frame.to_scene(x.to_numpy(), y.to_numpy())[:, :2]
             if ((on_scene >= low) & (on_scene <= high)).mean() > 0.5:
@@ -411,16 +411,16 @@ class LinksDraft:
         if crs is None:
             return rx, tx
         self.section["crs"] = crs
-        self.assume("links.crs", crs, f"positions {rx.x}, {rx.y} are on the scene in this projection")
+        self.assume("links.crs", crs, f"in this projection, the positions {rx.x}, {rx.y} lie on the scene")
         return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
 
     def _name_in_links(self, column: str | None) -> str | None:
-        """Name of a transmitter column in the links, changed if the links already have a column of this name."""
+        """Name of a transmitter column in the links. It is changed if the links already have a column of this name."""
         taken = column in self.table.frame and column != self._transmitter_key
         return f"{self._transmitter_key}_{column}" if taken else column
 
     def add_positions(self) -> None:
-        """Add the positions of both ends."""
+        """Draft the keys for the positions of both ends."""
         tx, rx = self.tx, self.rx
         self.section["tx"] = self._transmitter(tx, rx)
         self.section["rx"] = [rx.x, rx.y, RECEIVER_HEIGHT if rx.height is None else rx.height]
@@ -429,7 +429,7 @@ class LinksDraft:
         self._add_position_unit(tx, rx)
         reason = f"column names indicate {unit}" if "position_unit" not in self.section else "by their names"
         if unit == "degrees" and not column_names.matches(rx.x, "longitude"):
-            reason = "the positions are on the scene if read as degrees"
+            reason = "the positions lie on the scene if they are in degrees"
         if rx.height is None:
             reason += f"; no height: {RECEIVER_HEIGHT} m{self._unused_altitudes(self.table.frame)}"
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
@@ -447,13 +447,16 @@ class LinksDraft:
 
     @staticmethod
     def _unused_altitudes(frame: pd.DataFrame) -> str:
-        """Hint that a column of altitudes is ignored, because altitudes may be above sea level; empty without one."""
+        """Hint that an altitude column is ignored, as altitudes may be above sea level; empty without such a column."""
         unused = [str(name) for name in frame if column_names.words(name) & ALTITUDES]
-        hint = "is ignored, because it may be above sea level; rename it 'height' if it is above the ground"
+        hint = (
+            "is ignored, because altitudes may be above sea level; rename the column 'height' if they are above the "
+            "ground"
+        )
         return f" ({unused[0]} {hint})" if unused else ""
 
     def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
-        """Add the unit of the position columns if their names state a unit other than the metre."""
+        """Draft the unit of the position columns if their names state a unit other than the metre."""
         ends = [end for end in (tx, rx) if end is not None]
         if any(end.position == "geographic" for end in ends):
             names = [end.height for end in ends if end.height is not None]
@@ -470,8 +473,8 @@ class LinksDraft:
         ]
         if plain and rx.position != "geographic":
             raise InputError(
-                f"{self.links}: the columns {', '.join(names)} state a unit of {unit:g} m, except {', '.join(plain)}; "
-                "state the unit in the name of each column, or give all positions in metres"
+                f"{self.links}: the columns {', '.join(names)} state a unit of {unit:g} m, with the exception of "
+                f"{', '.join(plain)}; state the unit in the name of each column, or give all positions in metres"
             )
         if rx.position == "geographic":
             raise InputError(
@@ -515,16 +518,16 @@ class LinksDraft:
         return [float(part) for part in self.given.tx]
 
     def _name_transmitters(self, tx: PositionColumns) -> None:
-        """Add the column of transmitter names if the table of links contains the transmitter positions."""
+        """Draft the column of transmitter names if the table of links contains the transmitter positions."""
         if len(self.table.frame[[tx.x, tx.y]].drop_duplicates()) < 2:
             return
         name = transmitter_columns.find_transmitter_of_positions(self.table.frame, [tx.x, tx.y])
         if name is not None:
             self.section["transmitter"] = name
-            self.assume("links.transmitter", name, "each name has exactly one transmitter position")
+            self.assume("links.transmitter", name, "each name belongs to exactly one transmitter position")
 
     def _transmitter_at_origin(self, rx: PositionColumns) -> list[float | str]:
-        """Place the transmitter above the scene's origin if the distances in the table are measured from this point."""
+        """Place the transmitter above the origin of the scene if the table states distances from this point."""
         frame, name = self.table.frame, column_names.find_distance(self.table.frame)
         height = column_names.find_transmitter_height(frame)
         if (
@@ -538,16 +541,16 @@ class LinksDraft:
             if float(np.median(np.abs(distance - frame[name]))) < 0.05:
                 up = float(frame[height].iloc[0])
                 self.assume(
-                    "links.tx", f"0, 0, {up:g}", f"column {name} contains the distances from this point"
+                    "links.tx", f"0, 0, {up:g}", f"column {name} states the distances from this point"
                 )
                 return [0.0, 0.0, up]
         raise InputError(
-            f"{self.links}: no position of the transmitter; give --tx X,Y,Z [m] in the scene frame, or --transmitters "
-            "FILE"
+            f"{self.links}: the position of the transmitter is unknown; give --tx X,Y,Z [m] in the scene frame, or "
+            "--transmitters FILE"
         )
 
     def add_heights(self) -> None:
-        """Measure heights from the ground if the ground is not at z = 0 and no height is in the scene frame."""
+        """Measure heights from the ground if the ground is not at z = 0 and no heights are in the scene frame."""
         in_scene_frame = any(
             columns is not None and columns.position == "scene" and columns.height is not None
             for columns in (self.tx, self.rx)
@@ -561,5 +564,7 @@ class LinksDraft:
             return  # a link is outside the scene, or there is no ground
         if np.abs(ground).max() > 0.5:
             self.section["heights"] = "ground"
-            reason = f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are relative to the ground"
+            reason = (
+                f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights are above the ground"
+            )
             self.assume("links.heights", "ground", reason)

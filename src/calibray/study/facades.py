@@ -30,30 +30,30 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 0.5
-"""Largest distance of a wall from its polygon [m]; walls are on the outlines of buildings."""
+"""Maximum distance [m] between a wall and its polygon; walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance from a wall at which its sides are told apart [m]; points closer than this are on the wall."""
+"""Distance [m] from a wall at which its two sides are distinguished; points at smaller distances are on the wall."""
 
 
 class FacadeSection(Section):
     """``[facades.NAME]``: a separate material for those parts of walls that meet all the stated criteria.
 
     Attributes:
-        of: Material of the scene whose surfaces are divided. The new material has the same constants unless
-            ``[materials]`` states others.
+        of: Material of the scene whose surfaces are divided. The new material has the same constants, unless
+            ``[materials]`` states its own constants.
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
-        facing: Compass bearings [deg] between which the outward normal of the wall lies, clockwise from the first to
-            the second. The inside of a wall is the side under a roof. Without a roof, the order of the corners of the
-            triangles determines the inside.
+        facing: Compass bearings [deg] that limit the direction of the outward normal of the wall, clockwise from the
+            first to the second. The inside of a wall is the side under a roof. Without a roof, the order of the corners
+            of the triangles determines the inside.
         boxes: Rectangles that contain the wall: west, south, east, north [m] in the scene frame.
-        file: GeoJSON, Shapefile, GeoPackage or FlatGeobuf file of polygons; the walls are on the outlines of the
+        file: GeoJSON, Shapefile, GeoPackage or FlatGeobuf file of polygons. The walls are on the outlines of these
             polygons.
-        column: Column of the file; only polygons with the value NAME in this column are used. If absent, all polygons
-            are used.
-        position: "geographic" or "scene", as for ``[regions]``.
-        share: Share of the wall covered by strips of this material, such as windows.
+        column: Column of the file. Only polygons with the value NAME in this column are used; without `column`, all
+            polygons are used.
+        position: "geographic" or "scene", as in ``[regions]``.
+        share: Fraction of the wall that strips of this material, such as windows, cover.
         module: Distance between the centres of neighbouring strips [m], rounded so that a wall has a whole number of
             strips.
     """
@@ -78,7 +78,7 @@ class FacadeSection(Section):
                 f"storeys = {list(self.storeys)}: must be the first and the last storey, counted from 1"
             )
         if self.column is not None and self.file is None:
-            raise InputError("column needs file: it selects polygons of the file")
+            raise InputError("column selects polygons of a file; state file as well")
         return self
 
 
@@ -88,11 +88,11 @@ def with_facade_materials(
     constants: Mapping[str, Mapping[str, object]],
     frequency: float,
 ) -> Scene:
-    """The scene with the materials of facades, for which ``[materials]`` states `constants`.
+    """The scene with the materials of facades; `constants` are those that ``[materials]`` states for facades.
 
     Raises:
-        InputError: A facade has the name of a material, or divides a material that the scene lacks. ITU-R P.2040 does
-            not cover a material at the carrier [Hz].
+        InputError: A facade has the name of a material, or divides a material that the scene lacks; or ITU-R P.2040
+            does not cover a material at the carrier [Hz].
     """
     materials, laws = dict(scene.materials), dict(scene.laws)
     for name, section in facades.items():
@@ -119,7 +119,7 @@ def with_facade_materials(
 
 
 def without_facade_materials(scene: Scene, facades: Mapping[str, FacadeSection]) -> Scene:
-    """The scene without the materials of facades, as it is traced."""
+    """The scene without the materials of facades, as used for tracing."""
     if not facades:
         return scene
     materials, laws = (
@@ -136,9 +136,9 @@ def with_facades(
     place: Place,
     materials: Mapping[str, Material],
 ) -> Paths:
-    """The paths with the facades' materials at their interactions. If several facades apply, the first is used.
+    """The paths with the materials of facades at interactions. If several facades apply, the first is used.
 
-    `files` contains the resolved paths of the facades' files. `materials` are those of the scene and of the facades.
+    `files` contains the resolved paths of the files of facades. `materials` includes those of the scene and of facades.
 
     Raises:
         InputError: A file cannot be used, or there is no ground below a wall.
@@ -163,12 +163,12 @@ def _applies(
     surfaces: SceneSurfaces,
     point: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether all rules of a facade apply at points of its material [n]."""
+    """Whether all rules of a facade apply, for each point [n] of its material."""
     shapely = library("shapely", "scenes")
     applies = np.ones(len(point), dtype=bool)
     if section.storeys is not None:
         height = point[:, 2] - surfaces.ground_height(point[:, 0], point[:, 1])
-        # Storeys are numbered from 1, the ground floor.
+        # Storeys are numbered from 1 for the ground floor.
         storey = np.floor(height / section.storey_height) + 1
         applies &= (storey >= section.storeys[0]) & (storey <= section.storeys[1])
         # The ground is not part of a storey, even if it has the material of the walls.
@@ -177,15 +177,15 @@ def _applies(
         if not len(surfaces.walls):
             return np.zeros(len(point), dtype=bool)
         bearing, along, length, beside = _walls(surfaces, point)
-        # The ground and roofs face no compass direction.
+        # The ground and roofs have no compass direction.
         applies &= beside < BESIDE
         if section.facing is not None:
             start, end = section.facing
-            # Clockwise from start to end, even across north; equal ends mean a full turn.
+            # The sector runs clockwise from start to end, even across north; equal bearings mean a full turn.
             applies &= (bearing - start) % 360 <= ((end - start) % 360 or 360)
         if section.share is not None:
             strips = np.maximum(np.round(length / section.module), 1)
-            # One strip in the middle of each module.
+            # There is one strip in the middle of each module.
             applies &= np.abs((along * strips) % 1 - 0.5) < section.share / 2
     outlines = [shapely.box(*box) for box in section.boxes]
     if file is not None:
@@ -194,12 +194,12 @@ def _applies(
             if section.column not in columns:
                 remedy = did_you_mean(section.column, columns)
                 raise InputError(f"{file}: no column {shortened(section.column)!r}; {remedy}")
-            # In a column of numbers, 12 is stored as 12.0.
+            # A column of numbers stores 12 as 12.0.
             labels = [str(label).removesuffix(".0") for label in columns[section.column]]
             outline = outline[np.array(labels) == name.removesuffix(".0")]
             if not len(outline):
                 raise InputError(f"{file}: no polygon has {name!r} in its column {section.column!r}")
-        # Walls are on the outline itself, so a point on a wall may lie just outside it.
+        # Walls are on the outline itself, so a point on a wall may lie just outside the polygon.
         outlines += shapely.buffer(outline, NEAR).tolist()
     if outlines:
         area = shapely.union_all(outlines)
@@ -209,12 +209,12 @@ def _applies(
 
 
 def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """The wall nearest to each point in plan: bearing [deg], position along it (0 to 1), length [m] and distance [m].
+    """The wall nearest to each point in plan: bearing [deg], position along the wall (0 to 1), length and distance [m].
 
     Each array is [n]. The bearing is that of the outward normal; position 0 is the west or south end.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
-    # In plan, an upright triangle is a line: from its first to its last corner in order of x and y.
+    # In plan, an upright triangle is a line from its first to its last corner in order of x and y.
     plan = np.round(walls[:, :, :2], 6)
     order = np.lexsort((plan[..., 1], plan[..., 0]), axis=-1)
     ends = np.stack([plan[np.arange(len(plan)), order[:, k]] for k in (0, 2)], axis=1)
@@ -226,7 +226,7 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
     start, step = ends[nearest, 0], ends[nearest, 1] - ends[nearest, 0]
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     along = np.clip(((point[:, :2] - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
-    # The inside is under a roof; if both sides are or neither is, the order of the corners decides.
+    # The side under a roof is the inside; if both sides or neither are under a roof, the order of the corners decides.
     outward = normal[nearest] / np.linalg.norm(normal[nearest], axis=1, keepdims=True)
     front, back = (surfaces.under_roof(point + side * BESIDE * outward) for side in (1, -1))
     outward = np.where((front & ~back)[:, None], -outward, outward)
@@ -238,7 +238,7 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
 def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths: Paths) -> Effects:
     """The loss of specular reflections on rough surfaces; empty if no material is rough.
 
-    `stated` contains the standard deviation of the surface height of each material [mm].
+    `stated` contains the standard deviation [mm] of the surface height, by material name.
     """
     names = [parameters.names[index] for index in parameters.of_effects]
     number = {

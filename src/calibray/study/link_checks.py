@@ -1,4 +1,4 @@
-"""Checks of links for common mistakes in positions, units and angles, made before tracing.
+"""Checks links for common mistakes in positions, units and angles before tracing.
 
 Each finding is a suspicion supported by evidence, not a proof. An error is raised only if all receivers or all
 transmitters are far from the scene.
@@ -30,36 +30,37 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Largest plausible margin of path loss below free-space loss [dB]; a ground reflection adds up to 6 dB."""
+"""Largest plausible amount [dB] by which path loss is below free-space loss; a ground reflection adds up to 6 dB."""
 
 GUIDED_DB: Final = 12.0
-"""The same margin under a roof [dB]. In a corridor of 40 m by 2.4 m, four reflections can add 11 dB at 60 GHz."""
+"""Largest such amount [dB] under a roof. In a corridor of 40 m by 2.4 m, four reflections can add 11 dB at 60 GHz."""
 
 FAR: Final = 10.0
-"""Distance from the scene, in multiples of its size, beyond which links cannot belong to it."""
+"""Distance from the scene, in multiples of the scene size, beyond which links cannot belong to the scene."""
 
 CELL_SHARE: Final = 0.05
-"""Largest width of averaging areas, as a share of the scene's shorter side."""
+"""Maximum width of averaging areas, as a fraction of the shorter side of the scene."""
 
 HIGH: Final = 300.0
-"""Height above the top of the scene [m]; greater heights are probably altitudes above sea level, read as heights above
-ground. Drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300 m."""
+"""Height limit above the top of the scene [m]. Greater heights are probably altitudes above sea level that were read as
+heights above ground. Drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300
+m."""
 
 DOMINATED: Final = 0.5
-"""Effective share of the positions below which a few positions with many rows dominate the fit. In district 383,
-three of about 47 positions had 60 rows each (an effective share of 10 %). Prediction errors were 3.5 dB instead of 3.0
-dB, and 90 % intervals covered 86 % of the links instead of 93 %. With ten rows at every position (100 %), neither
-changed."""
+"""Effective fraction of the positions below which a few positions with many rows dominate the fit. In district 383,
+three of about 47 positions had 60 rows each (an effective fraction of 10 %). Prediction errors were 3.5 dB instead of
+3.0 dB, and 90 % intervals covered 86 % of the links instead of 93 %. With ten rows at every position (100 %), neither
+the errors nor the coverage changed."""
 
 SPREAD: Final = 5.0
-"""Width of the cells in which GPS positions count as one, for example those of a parked car [m]. Phones are accurate to
+"""Width [m] of the cells in which GPS positions, such as those of a parked car, count as one. Phones are accurate to
 4.9 m under an open sky (GPS.gov, GPS accuracy)."""
 
 LOSSY: Final = 0.5
-"""Mean gain [1] below which a table with a maximum of exactly 0 dBi probably contains relative gains."""
+"""Mean gain [1] below which a gain table with a maximum of exactly 0 dBi probably contains relative gains."""
 
 LINKS_PER_UNKNOWN: Final = 5
-"""Smallest number of links per unknown that is sufficient to constrain the unknowns of a fit."""
+"""Minimum number of links per unknown that is sufficient to constrain the unknowns of a fit."""
 
 _Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _TURNS: Final[dict[str, _Turn]] = {
@@ -75,11 +76,11 @@ _TURNS: Final[dict[str, _Turn]] = {
 def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     """The findings of `examine`, or a warning that shapely is missing.
 
-    There are no findings if only an external program can read the scene.
+    The result is empty if only an external program can read the scene.
 
     Raises:
-        InputError: All receivers or all transmitters are far from the scene, or the scene cannot be read. With an
-            external program, no error is raised.
+        InputError: All receivers or all transmitters are far from the scene, or the scene cannot be read. If the engine
+            is an external program, no error is raised.
     """
     if find_spec("shapely") is None:
         problem = "positions were not checked against the scene: shapely is not installed"
@@ -87,7 +88,7 @@ def suspicions(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
     try:
         return examine(study, links)
     except InputError:
-        # An external program may read scene files that Calibray cannot.
+        # An external program may be able to read scene files that Calibray cannot read.
         if study.engine.external:
             return ()
         raise
@@ -119,7 +120,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 
 def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """A finding with a remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
+    """Return a finding with a remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
     grouped = len(links.group_names) if links.group is not None else 1
     offsets = 0 if study.offset is None else grouped
     coefficients = sum(_count_coefficients(study, section, links) for section in study.nuisance.values())
@@ -132,7 +133,7 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
     problem = (
         f"{len(links)} links for {unknowns} unknowns ({counted}), fewer than {LINKS_PER_UNKNOWN} per unknown"
     )
-    remedy = "calibrate fewer parameters, or measure at more positions"
+    remedy = "calibrate fewer parameters or measure at more positions"
     if study.links.average is not None and study.links.average.by != "place":
         remedy = f"average over smaller areas (links.average.size), {remedy}"
     return (Finding("warning", links.source, problem, remedy),)
@@ -141,7 +142,7 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
 def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Measurements) -> int:
     """Number of coefficients of a nuisance term, one per group.
 
-    A random effect counts as one, because only its mean is free.
+    A random effect counts as one coefficient, because only its mean is free.
     """
     if section.per is None or section.prior == "auto":
         return 1
@@ -167,34 +168,34 @@ def _clock(links: Measurements) -> Iterator[tuple[str, str]]:
     for change, number in links.prepared.items():
         if change.startswith(NOT_ON_TRACK) and change != NOT_ON_TRACK:
             yield (
-                f"{number:,} {change}: the positions of the other rows may be wrong",
+                f"{number:,} {change}: the positions of the remaining rows may also be wrong",
                 "check the time zone of the table",
             )
 
 
 def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tuple[str, str]]:
-    """Check whether rows at a few positions, such as rows logged while parked, outweigh all others (Kish, 1965)."""
+    """Check whether rows at a few positions, such as those of a parked car, outweigh all other rows (Kish, 1965)."""
     cell = SPREAD if is_geographic else 0.01
     ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
-    # Equals the number of positions if all have equally many rows, and is nearly 1 if one has nearly all rows.
+    # The number of positions if all have equally many rows, and nearly 1 if one position has nearly all rows.
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
         within = f" within {cell:g} m" if is_geographic else ""
         average = f"{{ by = 'cell', size = {cell:g} }}" if is_geographic else "'place'"
         yield (
-            f"{count.max():,} of {len(links):,} links have the same position{within} and dominate fits, accuracy and "
+            f"{count.max():,} of {len(links):,} links have the same position{within}; they dominate fits, accuracy and "
             f"prediction intervals: {len(count):,} positions are equivalent to about {effective:.0f} positions",
-            f"average the rows of each position: links.average = {average}",
+            f"average the rows at each position: links.average = {average}",
         )
 
 
 def _transmitters(
     study: StudyModel, links: Measurements
 ) -> tuple[NDArray[np.float64], Callable[[NDArray[np.bool_]], str]]:
-    """Positions of the transmitters [n, 3], [m], and a function that counts and names those in a mask [n].
+    """Positions of the transmitters [n, 3], [m], and a function that counts and names the transmitters in a mask [n].
 
-    Transmitters with different names count separately, even at one position, such as the sectors of a mast.
+    Transmitters with different names, such as the sectors of a mast, count separately even at the same position.
     """
     column, frame = study.links.transmitter, pd.DataFrame(links.tx)
     named = column in links.frame
@@ -224,12 +225,12 @@ def _positions(study: StudyModel, overhead: SceneSurfaces, links: Measurements) 
         if high.any():
             yield (
                 f"{counted(high)} are more than {HIGH:g} m above the whole scene",
-                "check heights and their datum: links.heights = 'ground' measures them from the ground",
+                "check heights and their datum: with links.heights = 'ground', heights are above the ground",
             )
         touching = overhead.touching(points)
         if touching.any():
             yield (
-                f"{counted(touching)} touch the ground, a floor or a roof; the reflections from this surface are "
+                f"{counted(touching)} touch the ground, a floor or a roof, so reflections from this surface are "
                 "missed",
                 "give the height of the antenna, at least 1 cm above the surface",
             )
@@ -267,17 +268,17 @@ def _positions(study: StudyModel, overhead: SceneSurfaces, links: Measurements) 
     inside = roofed & ~overhead.underground(rx)
     if inside.any():
         problem = f"{counted_rx(inside)} are inside buildings"
-        yield problem, "correct or remove these receivers, or set links.inside = 'move'"
+        yield problem, "correct or remove these receivers or set links.inside = 'move'"
     inside = overhead.under_roof(tx) & ~overhead.underground(tx)
     if inside.any():
         problem = f"{counted_tx(inside)} are inside buildings"
-        yield problem, "check position and height: an antenna on a roof must be above the roof"
+        yield problem, "check the position and the height: an antenna on a roof must be above the roof"
 
 
 def _far_transmitters(
     study: StudyModel, links: Measurements, bounds: NDArray[np.float64]
 ) -> Iterator[tuple[str, str]]:
-    """Name the transmitters that are far from the scene.
+    """Report the transmitters that are far from the scene.
 
     Raises:
         InputError: All transmitters are far from the scene.
@@ -301,7 +302,7 @@ def _far_transmitters(
 
 
 def _far(bounds: NDArray[np.float64], positions: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
-    """The distance from the scene beyond which positions are far [m], and the mask of far positions [n]."""
+    """The distance [m] beyond which positions are far from the scene, and the mask of far positions [n]."""
     low, high = bounds[:2], bounds[3:5]
     # The limit is at least one kilometre, because the scene may be a room.
     furthest = FAR * max(float(np.max(high - low)), 100.0)
@@ -318,10 +319,10 @@ def refuse_far_receivers(
         bounds: West, south, bottom, east, north and top of the scene [6], [m].
         rx: Positions of the receivers [n, 3], [m].
         source: The table that contains the receivers.
-        is_geographic: Whether the table contains positions in degrees.
+        is_geographic: Whether the positions in the table are in degrees.
 
     Raises:
-        InputError: All receivers are farther away.
+        InputError: All receivers are farther from the scene.
     """
     furthest, far = _far(bounds, rx)
     if far.all():
@@ -343,7 +344,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """The axis changes that misplace fewest receivers, and their number; None if above a quarter of `wrong`."""
+    """The axis changes that misplace the fewest receivers, and that number; None if it exceeds a quarter of `wrong`."""
     if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -395,14 +396,14 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
         max(largest_gain_dbi(antenna) for antenna in link_antennas(study, end, links.table)[0])
         for end in ("tx", "rx")
     )
-    # The smallest possible free-space loss: along the main directions of the best antennas at both ends.
+    # The smallest possible free-space loss is that along the main directions of the best antennas at both ends.
     excess = free_space - gain - links.path_loss_db
     roofed = overhead.under_roof(links.tx) & overhead.under_roof(links.rx)
     below = excess > np.where(roofed, GUIDED_DB, BELOW_FREE_SPACE_DB)
     if below.mean() > 0.1:
         median = float(np.median(excess[below]))
         yield (
-            f"{int(below.sum())} of {len(links)} path losses are below free-space loss, by a median of "
+            f"{int(below.sum())} of {len(links)} path losses are below free-space loss, with a median difference of "
             f"{median:.0f} dB",
             "check tx_power_dbm (30 dB: watts instead of milliwatts), gains included in the values, scene.frequency "
             "and the sign",
@@ -413,7 +414,7 @@ def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
     """Check whether most measured delays belong to paths that are much longer than the scene."""
     longest = FAR * max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
     for name, section in study.observables.items():
-        # Devices add unknown delays to times of flight; a bias accounts for them.
+        # Devices add unknown delays to times of flight, which a bias accounts for.
         if KINDS[section.kind] != "s" or section.column is None or section.bias is not None:
             continue
         measured = links.table.numbers(section.column, gaps=True) * section.scale
@@ -451,10 +452,10 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
     antennas = [*study.stated_antennas.values(), *study.antenna_types.values()]
     for file in dict.fromkeys(antenna.gain_file for antenna in antennas if antenna.gain_file is not None):
         table = read_gain_table(file)
-        # A lossless antenna has a mean gain of 1, so its largest gain is above 0 dBi.
+        # A lossless antenna has a mean gain of 1, so its maximum gain exceeds 0 dBi.
         if table.gain_dbi.max() == 0 and table.efficiency < LOSSY:
             yield (
-                f"the largest gain in {file} is 0 dBi and the mean gain is {100 * table.efficiency:.0f} %, which "
+                f"the maximum gain in {file} is 0 dBi and the mean gain is {100 * table.efficiency:.0f} %, which "
                 "suggests gains relative to the main direction",
                 "give absolute gains [dBi]",
             )
@@ -487,10 +488,10 @@ def _spread(
     other: NDArray[np.float64],
     yaw: float,
 ) -> float:
-    """Standard deviation of path loss around a log-distance line, with the antenna gain removed [dB]."""
+    """Standard deviation [dB] of path loss around a log-distance line, without the antenna gain."""
     away = other - own
     azimuth = (np.arctan2(away[:, 1], away[:, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi
-    # Measured losses contain the antenna's gain; adding the gain removes the dependence on azimuth.
+    # Measured path loss includes the antenna gain; adding this gain removes the dependence on azimuth.
     level = links.path_loss_db + gain(azimuth)
     design = np.column_stack([np.ones(len(links)), np.log10(links.distance)])
     residual = level - design @ np.linalg.lstsq(design, level)[0]

@@ -69,7 +69,7 @@ class StudyModel(StudyContent, ABC):
     def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Self:
         """Create a study from sections structured as in TOML, without checking that the named files exist.
 
-        File names are relative to the folder of `path`, which need not exist.
+        File names are relative to the folder of `path`, and `path` need not exist.
 
         Raises:
             InputError: A key is unknown or a value is invalid. The message has one line per error.
@@ -85,7 +85,7 @@ class StudyModel(StudyContent, ABC):
             # Validation of JSON accepts a list as a tuple but converts nothing else: "4" is not a number.
             text = json.dumps(content, default=_plain)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
+            raise InputError(f"{path}: a value cannot be used ({error}); correct this value") from None
         try:
             study = cls.model_validate_json(text)
         except ValidationError as error:
@@ -95,7 +95,7 @@ class StudyModel(StudyContent, ABC):
         return study
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Files are relative to the study file, and another process may have another working folder.
+        # File names are relative to the study file, and another process may have a different working folder.
         return type(self).from_content, (self.content(), self._path.absolute())
 
     @property
@@ -105,7 +105,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def allows_blocks(self) -> bool:
-        """Whether blocks of links can be held out in turn, which is too expensive without replay."""
+        """Whether blocks of links can be held out in turn; this is too expensive without replay."""
         replaced = self.engine.exports_rays and self.method.name == "auto"
         return self.engine.name == "replay" or replaced
 
@@ -130,7 +130,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def transmitters_path(self) -> Path | None:
-        """The table of transmitters; None without such a table."""
+        """The table of transmitters; None if there is no such table."""
         file = self.links.transmitters
         return None if file is None else self._resolve("links.transmitters", file)
 
@@ -142,7 +142,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def rays_path(self) -> Path | None:
-        """The ray table that is replayed; None without such a table."""
+        """The ray table that is replayed; None if there is no such table."""
         file = self.engine.rays if isinstance(self.engine, ReplaySection) else None
         return None if file is None else self._resolve("engine.rays", file)
 
@@ -173,9 +173,9 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
-        """The transmit and receive antennas used for tracing, with resolved paths of gain tables.
+        """The transmit and receive antennas for tracing, with resolved paths of gain tables.
 
-        If the antennas at an end differ between links, tracing uses an isotropic vertical antenna at this end.
+        If the antennas at one end differ between links, tracing uses an isotropic vertical antenna at that end.
         """
         mounted, (tx, rx) = self.links.mountings, self.stated_antennas.values()
         return Antenna() if "tx" in mounted else tx, Antenna() if "rx" in mounted else rx
@@ -201,7 +201,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states for materials of the scene, by material name."""
+        """The constants in ``[materials]`` for materials of the scene, by material name."""
         return self._stated_constants(of_facades=False)
 
     def _stated_constants(self, of_facades: bool) -> dict[str, dict[str, Any]]:
@@ -213,18 +213,18 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def facade_constants(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states for facades, by facade name."""
+        """The constants in ``[materials]`` for facades, by facade name."""
         return self._stated_constants(of_facades=True)
 
     @property
     def roughness_mm(self) -> dict[str, float]:
-        """Standard deviations of the surface height [mm] that ``[materials]`` states, by material name."""
+        """Standard deviations of the surface height [mm] stated in ``[materials]``, by material name."""
         stated = {name: material.roughness_mm for name, material in self.materials.items()}
         return {name: height for name, height in stated.items() if height is not None}
 
     @property
     def nuisance_terms(self) -> dict[str, NuisanceTerm]:
-        """All nuisance terms by name, the offset first."""
+        """All nuisance terms by name; the offset comes first."""
         offset = {} if self.offset is None else {OFFSET: self.offset.term()}
         return offset | {name: section.term() for name, section in self.nuisance.items()}
 
@@ -236,7 +236,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def cluster_m(self) -> float | None:
-        """Side length of the squares that group the receivers for a nuisance term [m]; None without such a term."""
+        """Side length [m] of the squares that group receivers for a nuisance term; None if no term has such groups."""
         return next((item.cluster_m for item in self.nuisance.values() if item.cluster_m is not None), None)
 
     @property
@@ -246,17 +246,17 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def offset_groups(self) -> tuple[str, ...]:
-        """The columns whose labels define the groups of the offset; empty for a single offset or without an offset."""
+        """The columns whose labels define the groups of the offset; empty if there is no offset or a single offset."""
         return () if self.offset is None else self.offset.term().per
 
     @property
     def priors(self) -> LogNormal:
-        """The priors, each with the index of its parameter in a candidate."""
+        """The priors, with the index of each parameter in a candidate."""
         priors, linear = [], []
         for index, (name, entry) in enumerate(self.parameters.items()):
             if entry.prior is not None and entry.prior.std is not None:
-                # Antennas have additive errors around the stated pose; material constants are positive and have priors
-                # on the logarithm.
+                # Antennas have additive errors around the stated pose. Material constants are positive, so their priors
+                # apply to the logarithm.
                 priors.append((index, float(entry.start or 0.0), entry.prior.std))
                 linear.append(index)
             elif entry.prior is not None:
@@ -273,7 +273,7 @@ class StudyModel(StudyContent, ABC):
     def parameter_set(
         self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None
     ) -> Parameters:
-        """The parameters and their start values for a scene with materials `base`, in the order of the file.
+        """The parameters, in the order of the file, with their start values for a scene with materials `base`.
 
         Materials without a frequency law in `laws` are independent of frequency.
 
@@ -302,7 +302,7 @@ class StudyModel(StudyContent, ABC):
         return parameters
 
     def _effect_parameter(self, name: str, materials: Collection[str]) -> Parameter:
-        """The parameter of a region, a rough surface or an antenna. For an antenna, the value 0 is the stated pose."""
+        """The parameter of a region, a rough surface or an antenna. For an antenna, 0 stands for the stated pose."""
         entry = self.parameters[name]
         if name.endswith(f".{ROUGHNESS}"):
             check_material(name, materials)
@@ -311,7 +311,7 @@ class StudyModel(StudyContent, ABC):
                 name, *entry.bounds, stated if entry.start is None else float(entry.start), entry.scale
             )
         region = self.regions.get(name.removeprefix(PREFIX).rpartition(".")[0]) if PREFIX in name else None
-        # Antennas start at their stated pose, with an error of 0.
+        # Antennas start at their stated pose, which has an error of 0.
         start = 0.0 if region is None else region.specific_attenuation
         return Parameter(
             name, *entry.bounds, start if entry.start is None else float(entry.start), entry.scale
@@ -320,15 +320,15 @@ class StudyModel(StudyContent, ABC):
     def content(self) -> dict[str, Any]:
         """The study as a dictionary with all defaults, which `Study.from_content` can read."""
         content = self.model_dump(mode="json", exclude_none=True)
-        # These keys belong to other engines, one of which `replace` may choose.
+        # These keys belong to other engines, and `replace` may select one of these engines.
         content["engine"] |= self._other_engines
         return content
 
     def digest(self) -> str:
         """SHA-256 digest of the content of the study, independent of the layout of the file.
 
-        The order of the parameters is included, because the values of a candidate have the same order. The contents of
-        the named files are not included.
+        The digest depends on the order of the parameters, because the values of a candidate have the same order. It
+        does not depend on the contents of the named files.
         """
         content = self.content() | {"parameters": list(self.content()["parameters"].items())}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -345,7 +345,10 @@ class StudyModel(StudyContent, ABC):
         """
         for name, stated, file in self._named_files():
             if not exists(file):
-                remedy = "; to write it, use a study without engine.rays: calibray.read_rays and calibray.write_rays"
+                remedy = (
+                    "; to create this file, use calibray.read_rays and calibray.write_rays with a study without "
+                    "engine.rays"
+                )
                 raise InputError(
                     f"{self._path}: {name} = {shortened(stated)!r}: no such file, "
                     f"{shortened(str(file.absolute()), 300)}{remedy if name == 'engine.rays' else ''}"
@@ -385,13 +388,13 @@ class StudyModel(StudyContent, ABC):
             raise InputError(f"{self._path}: {name} = {file!r}: {error}") from None
 
     def held_out(self, links: Measurements) -> NDArray[np.bool_]:
-        """Mask of the held-out links [L]. All values are False without ``[holdout]`` or if links are held out in turn.
+        """Mask of the held-out links [L]; all False without ``[holdout]`` or if links are held out in turn.
 
         Raises:
-            InputError: The filter is malformed, names a missing column, or selects all links or none. The links lack
+            InputError: The filter is malformed, names a missing column, or selects all links or none; or the links lack
                 the column of labels that ``[holdout]`` names.
         """
-        # A missing column raises an error here, before anything is traced.
+        # A missing column must raise an error here, before tracing.
         if self.holdout is not None and self.holdout.by not in (None, "tx", *OBSTRUCTION):
             links.table.labels(self.holdout.by)
         if self.holdout is None or self.holdout.where is None:
@@ -399,7 +402,7 @@ class StudyModel(StudyContent, ABC):
         return links.held_out(self.holdout.where)
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Self:
-        """The study with another method, seed or engine; the options of a replaced method are dropped.
+        """The study with another method, seed or engine. A new method does not keep the options of the old method.
 
         Raises:
             InputError: A value is invalid.
@@ -415,12 +418,12 @@ class StudyModel(StudyContent, ABC):
 
 
 def _plain(value: object) -> Any:
-    """NumPy numbers and arrays as Python numbers and lists, and everything else as text."""
+    """NumPy numbers and arrays as Python numbers and lists, and all other values as text."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def _keys_without_effect(content: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The keys of a valid study file that have no effect, each with the missing key that it needs."""
+    """The keys of a valid study file that have no effect, each with the missing key on which it depends."""
     for section, keys in _NEEDED.items():
         for name, table in content.get(section, {}).items():
             for key, needed in keys.items():

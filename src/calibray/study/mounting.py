@@ -1,4 +1,4 @@
-"""The antenna of every link, its direction and its port power, from a study and the columns of the links."""
+"""The antenna of each link, with its direction and port power, from a study and the columns of the links."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 
 PORT_POWER: Final = "tx_port_power_dbm"
-"""Name of the column with the power that the transmitter of a link feeds into the antenna [dBm]."""
+"""Name of the column with the power [dBm] that the transmitter of a link feeds into its antenna."""
 
 LEAST_GAIN: Final = 1e-3
-"""Smallest gain along the straight line [1]. In nulls, paths in other directions carry the power. The patterns of 3GPP
-TR 38.901 are limited to 30 dB below the largest gain."""
+"""Minimum gain [1] along the straight line. In nulls, paths in other directions carry the power. The patterns of 3GPP
+TR 38.901 are limited to 30 dB below the maximum gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns of the antennas and their directions, and of transmitter names if parameters refer to them."""
+    """The columns of antennas and their directions, and of transmitter names if parameters refer to transmitters."""
     columns = [name for section in study.links.mountings.values() for name in section.columns.values()]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
@@ -42,7 +42,7 @@ def mounting_columns(study: StudyModel) -> tuple[str, ...]:
 
 
 def check_mounting_columns(study: StudyModel, table: SourceTable) -> None:
-    """Refuse a table that lacks a column of the antennas or their directions.
+    """Raise an error if a table lacks a column of the antennas or of their directions.
 
     Raises:
         InputError: A column is missing.
@@ -65,7 +65,7 @@ def check_mounting_columns(study: StudyModel, table: SourceTable) -> None:
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
-    """The mountings at the ends of the links ("tx", "rx") where these differ between links.
+    """The mountings at those ends of the links ("tx", "rx") at which antennas differ between links.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -88,7 +88,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
         yaw = np.arctan2(away[:, 1], away[:, 0])
         # Downtilt is positive downwards.
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
-    # A bearing is measured clockwise from north, yaw counter-clockwise from east; steering turns like the azimuth.
+    # A bearing is clockwise from north and yaw counter-clockwise from east; steering has the sense of the azimuth.
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     if section.azimuth_from == "north":
@@ -103,9 +103,10 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
 
 
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """Gain of the stated antennas of both ends along the straight line of each link [L], [dBi].
+    """Sum of the stated antenna gains of both ends along the straight line of each link [L], [dBi].
 
-    The gain at an end is 0 dBi if all links have the same antenna, with a Sionna RT pattern that has no main direction.
+    The gain at an end is 0 dBi if all links have the same single antenna with a Sionna RT pattern without main
+    direction.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -133,10 +134,9 @@ def pose_effects(
     parameters: Parameters,
     paths: tuple[Paths, NDArray[np.int64]],
 ) -> Effects:
-    """The effects of antenna pose errors on paths; empty without parameters such as "tx:CELL.azimuth".
+    """The effects of antenna pose errors on paths; empty if no parameter, such as "tx:CELL.azimuth", turns an antenna.
 
-    `mountings` and `table` describe all links; `paths` contains the paths of selected links and the indices of these
-    links.
+    `mountings` and `table` describe all links. `paths` contains the paths of selected links, and the link indices.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -193,7 +193,7 @@ def link_antennas(
 def _degrees(
     table: SourceTable, key: str, stated: float | str, limit: int, may_be_empty: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Angles [rows], [deg]. An empty cell counts as 0 in the rows that `may_be_empty` marks [rows]."""
+    """Angles [rows], [deg]. In rows selected by the mask `may_be_empty` [rows], an empty cell counts as 0."""
     if isinstance(stated, str) and pd.api.types.is_numeric_dtype(column := table.column(stated)):
         table = table.assign(**{stated: column.mask(column.isna() & may_be_empty, 0.0)})
     values = table.numbers(stated)
@@ -212,7 +212,7 @@ def states_port_power(study: StudyModel) -> bool:
 def port_power(study: StudyModel, table: SourceTable, optional: bool = False) -> NDArray[np.float64] | None:
     """Power that the transmitter of each row feeds into the antenna [rows], [dBm].
 
-    The power is the transmitted power minus the cable loss, or the EIRP minus the largest gain of the antenna. With
+    This power is the transmitted power minus the cable loss, or the EIRP minus the maximum gain of the antenna. With
     `optional`, the result is None if a column is missing.
 
     Raises:
@@ -231,14 +231,14 @@ def port_power(study: StudyModel, table: SourceTable, optional: bool = False) ->
 
 
 def largest_gain_dbi(antenna: Antenna) -> float:
-    """Largest gain of an antenna on a one-degree grid of all directions [dBi]."""
+    """Maximum gain [dBi] of an antenna over all directions on a one-degree grid."""
     zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
     # The amplitude of an array can be negative in side lobes.
     return float(20 * np.log10(np.abs(AntennaPattern.of(antenna).amplitude(zenith, azimuth)).max()))
 
 
 def is_omnidirectional(antenna: Antenna) -> bool:
-    """Whether the gain of an antenna varies by at most 3 dB over the directions in the horizontal plane of its mount.
+    """Whether the gain of an antenna varies by at most 3 dB in the horizontal plane of its mount.
 
     Example:
         >>> is_omnidirectional(Antenna("dipole")), is_omnidirectional(Antenna("tr38901"))
@@ -251,8 +251,8 @@ def is_omnidirectional(antenna: Antenna) -> bool:
 
 
 FIRST_SPREAD: Final = 0.25
-"""Initial value of an estimated spread, as a share of the width of the bounds. The standard deviation of a uniform
-distribution is 0.29 of its width."""
+"""Initial value of an estimated spread, as a fraction of the width of the bounds. The standard deviation of a uniform
+distribution is 0.29 times its width."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:
@@ -263,10 +263,10 @@ def estimated_fields(study: StudyModel) -> tuple[str, ...]:
 
 
 def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
-    """The content of a study with one parameter per transmitter for each parameter that has a `spread`.
+    """The content of a study in which each parameter with a `spread` becomes one parameter per transmitter.
 
-    A further parameter represents transmitters without measured links. Its prior describes the population; no link
-    narrows this prior.
+    A further parameter represents transmitters without measured links. Its prior is that of the population, and no link
+    constrains this parameter.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -280,13 +280,13 @@ def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
         std = FIRST_SPREAD * (upper - lower) if entry.spread == "auto" else entry.spread
         for label in (*labels, NEW):
             own = {"bounds": [lower, upper], "prior": {"std": std, "shared": True}}
-            # A transmitter with its own entry keeps it.
+            # A transmitter that has its own entry keeps this entry.
             content["parameters"].setdefault(f"{POSE}{label}.{name.rpartition('.')[2]}", own)
     return content
 
 
 def with_spreads(study: StudyModel, spreads: Mapping[str, float]) -> dict[str, Any]:
-    """The content of a study in which the transmitters' priors have new standard deviations, given by field."""
+    """The content of a study with new standard deviations of the transmitters' priors, given by field."""
     content = study.content()
     for name, entry in content["parameters"].items():
         field = name.rpartition(".")[2]

@@ -17,7 +17,7 @@ from calibray.measurements.observables import FLIGHTS, KINDS, PROFILES, SECTORS,
 from calibray.support.strict_models import Section, Text
 
 UNITS: Final = {
-    # A distance stands for the time that light takes to travel it.
+    # A distance stands for the time that light needs to travel this distance.
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "m": 1 / speed_of_light},
     "dB": {"dB": 1.0},
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
@@ -25,36 +25,36 @@ UNITS: Final = {
 """Accepted units of each dimension, with their values in SI units."""
 
 FILTERED: Final = "{column} [{name}]"
-"""Name of the column with the values of an observable that pass its filter."""
+"""Name of the column with those values of an observable that pass its filter."""
 
 Positive = Annotated[float, Field(gt=0)]
 
 
 class ObservableSection(Section):
-    """``[observables.NAME]``: a statistic of the paths of each link, measured in addition to path loss.
+    """``[observables.NAME]``: a statistic of the paths of each link that was measured in addition to path loss.
 
     Attributes:
         kind: The measured quantity.
-        column: Column of the measured values; a link without a value lacks this observable.
+        column: Column of the measured values. Links without a value do not have this observable.
         columns: Columns of the bins of a profile, instead of `column`.
         file: File of measured multipath components or impulse responses from which the values are computed, instead of
             columns.
         id: Column of link labels, in the table of links and in a multipath table.
-        where: Row filter that selects the links with this observable; if absent, all links have this observable.
+        where: Row filter that selects the links with this observable. If absent, all links have the observable.
         compass: Whether azimuths in the file are compass bearings, clockwise from north.
         sample_rate: Sample rate of impulse responses without delays [Hz].
-        margin_db: Margin by which samples of an impulse response must exceed the noise to be used [dB].
+        margin_db: Margin [dB] by which a sample of an impulse response must exceed the noise to be used.
         unit: Unit of the values: "s", "ms", "us", "ns", "ps" or "m" for times ("m" is the distance travelled at the
             speed of light), "dB" for levels, "rad" or "deg" for angles.
         std: Standard deviation of the error of a value, in `unit`; estimated if absent.
-        bias: "all" for an unknown bias common to all values, or a column of labels for one bias per label. If absent,
-            there is no bias.
+        bias: "all" for one unknown bias of all values, or a column of labels for one bias per label. If absent, there
+            is no bias.
         path: Path that determines a time of flight: "mean" (the mean over all paths), "first" or "strongest".
-        dynamic_range_db: Range below the strongest path in which the receiver detects paths [dB]; if absent, the
+        dynamic_range_db: Power range [dB] below the strongest path in which the receiver detects paths. If absent, the
             receiver detects all paths.
         floor_db: Path gain below which the receiver detects no paths [dB]; no limit if absent.
         window: Longest delay after the first path [s]; no limit if absent.
-        bandwidth: Bandwidth of the receiver [Hz]; if absent, the receiver resolves all paths.
+        bandwidth: Bandwidth of the receiver [Hz]. If absent, the receiver resolves all paths.
         edges: Edges of the bins of a power delay profile, as delays after the first path [s]. N bins have N + 1 edges.
         edges_deg: Edges of angular sectors, as azimuths counter-clockwise from the x axis [deg].
     """
@@ -103,7 +103,7 @@ class ObservableSection(Section):
             )
         if (self.column is not None) + bool(self.columns) + (self.file is not None) != 1:
             raise InputError(
-                "give exactly one of column (of the measured values), columns (one for each bin) and file"
+                "give exactly one of column (for the measured values), columns (one per bin) and file"
             )
         self._check_bins()
         return self
@@ -123,23 +123,23 @@ class ObservableSection(Section):
         bins = len(edges) - 1 if self.file is not None else max(len(self.columns), 1)
         if self.kind not in PROFILES:
             if len(self.columns) > 1:
-                raise InputError(f"columns: a {self.kind} has a single column; use the key column instead")
+                raise InputError(f"columns: a {self.kind} has only one column; use the key column instead")
             return
         if len(edges) != bins + 1 or bins < 1 or not (np.diff(edges) > 0).all():
             raise InputError(
-                f"edges: {edges.tolist()}, must be {max(bins, 1) + 1} increasing numbers, one more than the bins"
+                f"edges: {edges.tolist()}, must be {max(bins, 1) + 1} increasing numbers, one more than there are bins"
             )
         if self.kind in SECTORS and edges[-1] - edges[0] > 360:
             raise InputError(f"edges_deg: span {edges[-1] - edges[0]:g} degrees, must span at most 360")
 
     @property
     def scale(self) -> float:
-        """Value of the unit in SI units."""
+        """Value of one unit in SI units."""
         return UNITS[KINDS[self.kind]][self.unit]
 
     @property
     def statistic(self) -> Statistic:
-        """The statistic to compute from the modelled paths."""
+        """The statistic that is computed from the modelled paths."""
         edges = None
         if self.kind in PROFILES:
             low, high = self.edges or np.radians(self.edges_deg).tolist()
@@ -149,12 +149,12 @@ class ObservableSection(Section):
         )
 
     def wanted(self, name: str) -> Wanted:
-        """The request to an external program for this observable."""
+        """The request for this observable that an external program receives."""
         return Wanted(name, self.statistic, self.unit, self.scale)
 
 
 def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, ObservableSection]:
-    """The sections, with those of several bins split into one section per bin, named NAME_1, NAME_2, ...
+    """The sections. A section with several bins is split into one section per bin, named NAME_1, NAME_2, ...
 
     Raises:
         InputError: Two sections have the same name.
@@ -170,7 +170,7 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
             parts = {
                 f"{name}_{number}": section.model_copy(update={
                     "column": column, "columns": (),
-                    # Both edges of this bin; the key that is not used stays empty.
+                    # These are the two edges of the bin; the key that does not apply stays empty.
                     "edges": section.edges[number - 1 : number + 1],
                     "edges_deg": section.edges_deg[number - 1 : number + 1],
                 })
@@ -185,7 +185,8 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
 def filtered_values(section: ObservableSection, table: SourceTable) -> NDArray[np.float64] | None:
     """Values of an observable [rows] in the study's unit, NaN for rows that its filter excludes.
 
-    None if the filter cannot be applied to the rows, for example because the links get one of its columns later.
+    The result is None if the filter cannot be applied to the rows, for example because one of its columns is added
+    later.
 
     Raises:
         InputError: The column of values cannot be used.

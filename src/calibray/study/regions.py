@@ -37,11 +37,11 @@ WOODLAND: Final = (1.15, 0.43)
 Mulhouse)."""
 
 EXPONENT: Final = 0.284
-"""Frequency exponent of the specific attenuation: Weissberger 1982, 0.45 f^0.284 dB/m for up to 14 m of dense, dry,
+"""Frequency exponent of the specific attenuation. Weissberger (1982): 0.45 f^0.284 dB/m for up to 14 m of dense, dry,
 in-leaf trees, with f from 0.23 to 95 GHz."""
 
 MOST_CELLS: Final = 400
-"""Largest number of cells along each side of the grid of ground heights; computing 160,000 heights takes a second."""
+"""Maximum number of cells along each side of the grid of ground heights; 160,000 heights take a second to compute."""
 
 Height = float | str
 
@@ -52,7 +52,7 @@ def dense_trees(frequency: float) -> float:
 
 
 class RegionSection(Section):
-    """``[regions.NAME]``: polygons in which paths have an extra loss.
+    """``[regions.NAME]``: polygons in which paths have extra loss.
 
     Attributes:
         file: GeoJSON, Shapefile, GeoPackage or FlatGeobuf file with the polygons, relative to the study file's folder.
@@ -60,15 +60,16 @@ class RegionSection(Section):
         boxes: Rectangles instead of a file: west, south, east, north [m] in the scene frame.
         position: "geographic" if the coordinates are in the reference system that the file states, "scene" if they are
             in the scene frame [m].
-        heights: "ground" for heights above the ground of the scene, which always applies to a canopy. If absent,
-            heights are above z = 0 of the scene.
-        bottom: Height of the bottom of the region: a number [m], or a column of the file, in metres or in the unit that
-            the column name states.
+        heights: "ground" for heights above the ground of the scene; the heights of a canopy are always above the
+            ground. If absent, heights are above z = 0 of the scene.
+        bottom: Height of the bottom of the region: a number [m], or a column of the file (in metres, or in the unit
+            stated in the column name).
         top: Height of the top of the region, in the same form; not allowed with a canopy.
         specific_attenuation: Loss per unit length of a short path inside the region, at the study's carrier [dB/m]; the
-            start value if this is a parameter.
-        frequency_exponent: Frequency exponent [1] of the specific attenuation, for links at other carriers.
-        maximum_db: Loss of a very long path inside the region [dB]; if absent, the ITU-R P.833 value for woodland.
+            start value if the specific attenuation is a parameter.
+        frequency_exponent: Frequency exponent [1] that scales the specific attenuation to other carriers.
+        maximum_db: Loss of a very long path inside the region [dB]. If absent, the ITU-R P.833 value for woodland is
+            used.
     """
 
     file: Text | None = None
@@ -85,7 +86,9 @@ class RegionSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if sum((self.file is not None, self.canopy is not None, bool(self.boxes))) != 1:
-            raise InputError("a region is defined by a file, a canopy or boxes; give exactly one of these")
+            raise InputError(
+                "a region is defined by a file, a canopy or boxes; give exactly one of these keys"
+            )
         for box in self.boxes:
             west, south, east, north = box
             if not (west < east and south < north):
@@ -95,10 +98,10 @@ class RegionSection(Section):
                 )
         if (self.top is None) != (self.canopy is not None):
             raise InputError(
-                "a region of polygons or boxes needs top [m], and a region with a canopy must not have top"
+                "a region of polygons or boxes needs top [m], but a region with a canopy must not state top"
             )
         if self.file is None and (isinstance(self.bottom, str) or isinstance(self.top, str)):
-            raise InputError("bottom and top must be numbers [m]; column names need a file")
+            raise InputError("bottom and top must be numbers [m], because column names apply only to a file")
         if isinstance(self.bottom, float) and isinstance(self.top, float) and not self.bottom < self.top:
             raise InputError(f"bottom = {self.bottom:g}: must be less than top = {self.top:g} [m]")
         return self
@@ -145,11 +148,11 @@ class RegionSection(Section):
         if self.heights is None and self.canopy is None:
             return Region(outline, bottom, top)
         surfaces = place.surfaces()
-        # Outside the scene, the height of the ground is unknown.
+        # The height of the ground is unknown outside the scene.
         outline = shapely.intersection(outline, shapely.box(*surfaces.bounds[[0, 1, 3, 4]]))
         inside = np.flatnonzero(~shapely.is_empty(outline))
         outline, bottom, top = outline[inside], bottom[inside], top[inside]
-        # One point inside each polygon; the centroid of a non-convex polygon can be outside.
+        # Take a point inside each polygon; the centroid of a non-convex polygon can be outside.
         ground = surfaces.lowest_surface(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
         if (missing := inside[np.isinf(ground)]).size:
             raise InputError(
@@ -176,7 +179,7 @@ def _terrain(surfaces: SceneSurfaces) -> Terrain:
 def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArray[Any], dict[str, NDArray]]:
     """Polygons of a vector file [n] in the scene frame, and the columns of the attribute table.
 
-    `position` is "geographic" for coordinates in the reference system of the file, "scene" for the scene frame.
+    `position` is "geographic" for coordinates in the reference system of the file, or "scene" for the scene frame.
 
     Raises:
         InputError: The file cannot be read or contains no polygon, or the scene is not georeferenced.
@@ -189,7 +192,9 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
     # Polygons and multipolygons.
     polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
     if not polygon.any():
-        raise InputError(f"{path}: none of the {len(polygon)} features is a polygon; give a file of outlines")
+        raise InputError(
+            f"{path}: contains no polygon ({len(polygon)} other features); give a file of outlines"
+        )
     outline = shapely.make_valid(features.outline[polygon])
     if position == "geographic":
         known = _known(frame, path)
@@ -212,7 +217,7 @@ def _known(frame: Frame | None, path: Path) -> Frame:
 
 @dataclass(frozen=True)
 class Place:
-    """A scene's georeference, if known, and a function that reads its surfaces, for regions and facades."""
+    """The georeference of a scene, if known, and a function that reads the surfaces, for regions and facades."""
 
     frame: Frame | None
     surfaces: Callable[[], SceneSurfaces]
@@ -249,7 +254,7 @@ def region_effects(
     *,
     displaced: bool = False,
 ) -> Effects:
-    """The extra loss of paths in regions. Specific attenuations are stated at the carrier `frequency` [Hz].
+    """The extra loss of paths in regions. The stated specific attenuations apply at the carrier `frequency` [Hz].
 
     If `displaced`, paths end at displaced receivers instead of the receivers of the links.
     """
@@ -281,7 +286,8 @@ def _segments(
     """The straight segments of all paths: index of the path [k] and both end points [k, 3], [m]."""
     number = np.arange(paths.num_paths)
     path = np.repeat(number, np.diff(paths.first) + 1)
-    # A path of n interactions has n + 1 segments, so the segments of path p start p places after its interactions.
+    # A path with n interactions has n + 1 segments, so the first segment of path p is p places after its first
+    # interaction.
     begins, ends = paths.first[:-1] + number, paths.first[1:] + number
     start = np.empty((len(path), 3))
     end = np.empty((len(path), 3))

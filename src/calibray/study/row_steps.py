@@ -59,7 +59,7 @@ def study_links(study: StudyModel) -> Measurements:
 
 
 def link_columns(study: StudyModel) -> LinkColumns:
-    """The columns of the table of links, including the columns that group the offset.
+    """The columns of the table of links, including those that define the groups of the offset.
 
     Raises:
         InputError: Keys of ``[links]`` contradict each other.
@@ -71,7 +71,7 @@ def link_columns(study: StudyModel) -> LinkColumns:
 
 
 def row_steps(study: StudyModel) -> Preparation:
-    """The steps that convert rows to links, as stated in a study.
+    """The steps, as stated in a study, that convert rows to links.
 
     Raises:
         InputError: The scene is not georeferenced or cannot be read.
@@ -85,13 +85,13 @@ def row_steps(study: StudyModel) -> Preparation:
     # Columns computed from the scene are added to the links later.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
     keep += [links.frequency] if links.frequency else []
-    # Values that a filter excludes must not enter the means of links.
+    # The means of links must not include values that a filter excludes.
     filtered: dict[str, Compute] = {
         FILTERED.format(column=item.column, name=name): partial(filtered_values, item)
         for name, item in study.observables.items()
         if item.column is not None and item.where is not None
     }
-    # Means of equal labels and positions could differ from them in the last digit.
+    # A mean of equal labels or positions could differ from them in the last digit.
     others = {*keep, *links.tx, *links.rx, *POSITION_COLUMNS, links.value, "constant", "log_distance"}
     means = {*(term.by for term in study.nuisance_terms.values()), links.position_error_m}
     return replace(
@@ -121,10 +121,10 @@ def row_steps(study: StudyModel) -> Preparation:
 
 
 def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> NDArray[Any]:
-    """Labels [rows] of the parts of a table that are held out separately.
+    """Labels [rows] of those parts of a table that are held out separately.
 
     All labels are 0 if the parts depend on the measured value or on columns that averaging adds. Such parts are
-    determined from the links, after averaging and merging.
+    determined later from the averaged and merged links.
     """
     table, none = replace(table, frame=table.frame.drop(columns=value, errors="ignore")), np.zeros(len(table))
     if holdout.by is not None:
@@ -136,16 +136,16 @@ def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> 
 
 
 def row_track(study: StudyModel) -> Track | None:
-    """The track with the positions of the rows, or None."""
+    """The track with the positions of the rows; None if there is no track."""
     track = study.links.track
     return None if track is None else Track(str(study.track_path), track.time, track.longest_gap, track.clock)
 
 
 def position_steps(study: StudyModel) -> Preparation:
-    """The steps that determine the positions of the antennas of rows. No row is removed.
+    """The steps that determine the antenna positions of rows. No row is removed.
 
     Raises:
-        InputError: As for `row_steps`.
+        InputError: The scene is not georeferenced or cannot be read.
     """
     links, transmitters = study.links, study.transmitters_path
     return Preparation(
@@ -159,7 +159,7 @@ def position_steps(study: StudyModel) -> Preparation:
     )
 
 
-# Code that reads a scene's meshes imports SciPy, so it is imported only for studies that need it.
+# Code that reads meshes imports SciPy, so this code is imported only for studies that need meshes.
 
 
 def _ground(study: StudyModel) -> Ground:
@@ -173,10 +173,10 @@ def _move_outside(study: StudyModel) -> MoveOutside:
 
 
 def scene_frame(study: StudyModel) -> Frame:
-    """The georeference of the scene, as stated in the study or else in the scene file.
+    """The georeference of the scene, from the study or, if the study states none, from the scene file.
 
     Raises:
-        InputError: Neither file states a georeference, or the projection is unknown.
+        InputError: Neither the study nor the scene file states a georeference, or the projection is unknown.
     """
     frame = known_frame(study)
     if frame is None:
@@ -220,14 +220,15 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
     regions = {name: section.region(paths[name], place) for name, section in study.regions.items()}
     for name in [name for name, region in regions.items() if not len(region.outline)]:
         _LOG.warning(
-            "%s: [regions.%s] is outside the scene, so it has no effect; check its position, or remove it",
+            "%s: [regions.%s] is outside the scene and has no effect; check the position of the region, or remove the "
+            "region",
             study.path, name,
         )  # fmt: skip
     return regions
 
 
 def scene_place(study: StudyModel) -> Place:
-    """What regions and facades need from the scene."""
+    """The georeference and the surfaces of the scene, for regions and facades."""
     return Place(known_frame(study), partial(_surfaces, study.scene_source))
 
 

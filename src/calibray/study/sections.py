@@ -29,8 +29,8 @@ class SceneSection(Section):
         frequency: Carrier frequency [Hz].
         bandwidth: Bandwidth over which power is averaged [Hz].
         origin: Longitude and latitude [deg] of the origin of the scene, for geographic positions.
-        crs: Projection of the x and y coordinates of the scene, for instance "EPSG:32632"; if absent, a local
-            projection at the origin.
+        crs: Projection of the x and y coordinates of the scene, for instance "EPSG:32632". If absent, a local
+            projection around the origin is used.
     """
 
     file: Text
@@ -49,11 +49,11 @@ class SceneSection(Section):
 
 
 class MaterialSection(Section):
-    """One entry of ``[materials]``: constants that replace those in the scene.
+    """One entry of ``[materials]``: constants that override those in the scene.
 
     Attributes:
         itu: Name of the ITU-R P.2040 material that determines permittivity and conductivity.
-        revision: Revision of ITU-R P.2040; only with `itu`.
+        revision: Revision of ITU-R P.2040; allowed only with `itu`.
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
@@ -62,8 +62,8 @@ class MaterialSection(Section):
         xpd_coefficient: Cross-polarization discrimination coefficient [1].
         scattering_pattern: "lambertian", "directive" or "backscattering".
         alpha_r: Exponent [1] of the lobe around the specular direction.
-        alpha_i: Exponent [1] of the lobe back towards the source.
-        lambda_: Share [1] of the diffuse power in the lobe around the specular direction.
+        alpha_i: Exponent [1] of the backscattering lobe towards the source.
+        lambda_: Fraction [1] of the diffuse power in the lobe around the specular direction.
         roughness_mm: Standard deviation of the surface height [mm]. Roughness attenuates specular reflections.
     """
 
@@ -84,7 +84,7 @@ class MaterialSection(Section):
     def _physical(self) -> Self:
         if self.revision is not None and self.itu is None:
             raise InputError(
-                f"revision = {self.revision!r} without itu; name the ITU-R material, or remove the revision"
+                f"revision = {self.revision!r} without itu; name the ITU-R material or remove the revision"
             )
         stated = self.model_dump(exclude_none=True, exclude={"itu", "revision", "roughness_mm"})
         Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **stated})
@@ -96,11 +96,11 @@ class AverageSection(Section):
 
     Attributes:
         by: "place" averages samples at the same receiver position, "cell" in cells of a square grid, "distance" in
-            intervals of the distance travelled in the order of the rows, and "time" in time windows.
+            intervals of the travelled distance (in row order), and "time" in time windows.
         size: Width of a cell or length of an interval [m], or duration of a window [s]; required except for "place".
-        time: Column of times; only for "time".
+        time: Column of times; allowed only with "time".
         unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
-        minimum_count: Smallest number of samples in an average; averages over fewer samples are excluded.
+        minimum_count: Minimum number of samples in an average; averages over fewer samples are excluded.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -137,7 +137,7 @@ class TrackSection(Section):
     Attributes:
         file: GPX file, relative to the study file's folder.
         time: Column with the times of the rows, in ISO 8601 or as seconds since 1970.
-        longest_gap: Longest time between two track points [s]; rows in longer gaps are excluded.
+        longest_gap: Longest permitted time [s] between two track points; rows in longer gaps are excluded.
         clock: Time by which the clock of the table is ahead of the clock of the track [s].
     """
 
@@ -152,15 +152,15 @@ class MountingSection(Section):
 
     Attributes:
         type: Column with names from ``[antennas.types]``. If absent, all links have the antenna of ``[antennas]``.
-        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. The antenna is rotated by this angle in
-            addition to its orientation in ``[antennas]``.
+        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. This rotation is added to the orientation
+            stated in ``[antennas]``.
         azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
-        electrical_downtilt_deg: Downward shift [deg] of the pattern in the frame of the antenna or, for an array, of
-            its beam; a number or a column.
-        steering_deg: Azimuth to which the beam of an array is steered electrically, relative to the antenna [deg]; a
-            number or a column. It is measured clockwise if azimuths are compass bearings.
-        aim: "other end" points every antenna at the other end of its link; this replaces azimuth and downtilt.
+        electrical_downtilt_deg: Downward tilt [deg] of the pattern or, for an array, of the beam, in the frame of the
+            antenna; a number or a column.
+        steering_deg: Azimuth [deg] to which the beam of an array is steered electrically, relative to the antenna; a
+            number or a column. This azimuth is clockwise if azimuths are compass bearings.
+        aim: "other end" points every antenna at the other end of its link and replaces azimuth and downtilt.
     """
 
     type: Text | None = None
@@ -181,13 +181,13 @@ class MountingSection(Section):
 
     @property
     def columns(self) -> dict[str, str]:
-        """The columns of the table of links that this section names, by key."""
+        """The columns of the table of links named in this section, by key."""
         keys = ("type", "azimuth_deg", "downtilt_deg", "electrical_downtilt_deg", "steering_deg")
         return {key: getattr(self, key) for key in keys if isinstance(getattr(self, key), str)}
 
 
 class LinksSection(Section):
-    """``[links]``: the table of measured links, and the conversion of its rows to links.
+    """``[links]``: the table of measured links, and the rules that convert its rows to links.
 
     Attributes:
         file: CSV, Parquet or Excel file, relative to the study file's folder.
@@ -195,17 +195,18 @@ class LinksSection(Section):
             "geographic". Each coordinate is a number or a column.
         rx: Receiver position, in the same form.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for a received power with
-            an unknown transmitted power.
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm] for a received power if
+            the transmitted power is unknown.
         position: "scene" for metres in the scene frame, "geographic" for longitude and latitude or for coordinates in
             `crs`.
-        crs: Reference system of "geographic" positions, such as EPSG:32632; longitude and latitude if absent.
-        position_unit: Length of one unit of the position columns in the scene frame [m].
+        crs: Reference system of "geographic" positions, such as EPSG:32632. If absent, positions are longitude and
+            latitude.
+        position_unit: Length [m] of one unit of the position columns; only with "scene".
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column; required for received powers.
-        eirp_dbm: Radiated power in the main direction (EIRP) [dBm], instead of the transmitted power.
+        eirp_dbm: Radiated power in the main direction (EIRP) [dBm], stated instead of the transmitted power.
         cable_loss_db: Loss between transmitter and antenna [dB], a number or a column; requires a transmitted power.
         tx_antenna: Antennas of the transmitters, if these differ between links.
         rx_antenna: Antennas of the receivers, if these differ between links.
@@ -220,12 +221,12 @@ class LinksSection(Section):
             the scene frame.
         transmitters: Table with one row per transmitter, relative to the study file's folder.
         transmitter: Column with the name of the transmitter, in both tables.
-        missing: Numbers that represent missing measurements, in addition to common codes such as 100 or -999.
+        missing: Numbers that stand for missing measurements, in addition to common codes such as 100 or -999.
         noise_floor_dbm: Noise floor [dBm]. A missing received power is treated as below the noise floor.
-        below_floor: Treatment of rows at or below the noise floor: "exclude" removes these rows, and "censor" keeps the
-            rows as upper bounds of the received power, which the intervals account for.
+        below_floor: Treatment of rows at or below the noise floor: "exclude" removes these rows; "censor" keeps them as
+            upper bounds of the received power, which intervals take into account.
         inside: Treatment of receivers inside buildings: "keep", "drop", or "move" to the nearest point outside.
-        average: How samples are averaged.
+        average: Rule by which samples are averaged.
     """
 
     file: Text
@@ -267,8 +268,8 @@ class LinksSection(Section):
             )
         if self.crs is not None and (self.position != "geographic" or self.track is not None):
             raise InputError(
-                f"links.crs = {self.crs!r}: is the reference system of geographic position columns; set links.position "
-                "= 'geographic', without a track"
+                f"links.crs = {self.crs!r}: applies only to geographic position columns; set links.position "
+                "= 'geographic', and remove the track"
             )
         if self.eirp_dbm is not None and (self.tx_power_dbm is not None or self.cable_loss_db is not None):
             raise InputError(
@@ -291,7 +292,7 @@ class LinksSection(Section):
         if self.below_floor == "censor" and self.average is not None:
             raise InputError(
                 "links.below_floor = 'censor' with [links.average]: averages already include samples below the noise "
-                "floor, at half its power; remove one of these keys"
+                "floor, as half the power of the floor; remove one of these keys"
             )
         return self
 
@@ -310,7 +311,7 @@ class AntennasSection(Section):
         rx: The receive antenna.
         types: Further antennas by name, for ``links.tx_antenna.type`` and ``links.rx_antenna.type``.
         known: Whether an engine that exports rays used these antennas. By default, isotropic vertical antennas at both
-            ends (the assumption of a draft) are treated as unknown.
+            ends, which a draft assumes, count as unknown.
     """
 
     tx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]

@@ -66,19 +66,19 @@ _LOG: Final = logging.getLogger(__name__)
 @final
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """An opened study: its links, scene and parameters, each read once, and the ray tracer.
+    """An opened study: its links, scene and parameters, which are read once, and the ray tracer.
 
     Attributes:
         study: The study.
         links: All links of the study, including the held-out links.
-        scene: The scene with the start values of the parameters, because the tracer samples paths according to the
-            materials.
+        scene: The scene with the start values of the parameters, because the materials affect how the tracer samples
+            paths.
         parameters: The parameters, in the order of the values of a candidate.
         held_out: Mask of the held-out links [L].
         factory: Function that opens the scene in a ray tracer.
-        placed: Values of the parameters at which paths are traced, if parameters displace antennas; start values if
-            absent.
-        neighbours: Distances of the neighbouring positions that are traced, as shares of the largest displacement.
+        placed: Values of the parameters at which paths are traced, if parameters displace antennas; by default, the
+            start values.
+        neighbours: Distances to the neighbouring positions that are traced, as fractions of the largest displacement.
     """
 
     study: StudyModel
@@ -112,7 +112,7 @@ class Setup:
         if links is None:
             links = study_links(study)
             if any(entry.spread is not None for entry in study.parameters.values()):
-                # The transmitters are known only from the links.
+                # Only the links determine which transmitters exist.
                 study = type(study).from_content(with_population(study, links), study.path)
             held_out = study.held_out(links)
             columns = {POSE: study.links.transmitter, RECEIVER: study.links.device}
@@ -121,7 +121,7 @@ class Setup:
         scene = _scene_of(study, study.scene.frequency)
         parameters = study.parameter_set(scene.materials, scene.laws)
         parameters.check_carriers([frequency for frequency, _ in links.carriers])
-        # The tracer samples reflection and refraction with the scene's constants, which are the start values here.
+        # The tracer samples reflection and refraction with the constants of the scene, here the start values.
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
         if held_out is None:
             held_out = np.zeros(len(links), dtype=bool)
@@ -129,7 +129,7 @@ class Setup:
         return setup.with_obstruction() if study.uses_obstruction else setup
 
     def opened(self) -> Setup:
-        """The setup itself, so that functions can accept both studies and opened studies."""
+        """Return the setup itself, so that functions can accept both studies and opened studies."""
         return self
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
@@ -150,7 +150,7 @@ class Setup:
         return self._with_tracer(replace(self, parameters=parameters))
 
     def with_obstruction(self) -> Setup:
-        """The setup with the columns that are computed from the scene added to its links (`obstruction.COLUMNS`)."""
+        """The setup whose links have the columns that are computed from the scene (`obstruction.COLUMNS`)."""
         study = self.study
         links = with_obstruction(
             self.links,
@@ -163,9 +163,9 @@ class Setup:
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on paths that are not due to material constants, such as antenna errors and losses in regions.
+        """Effects on paths that material constants do not cause, such as antenna errors and losses in regions.
 
-        `links` contains the indices of the paths' links among all links; if None, the paths belong to all links.
+        `links` contains the indices of the links to which the paths belong; if None, the paths belong to all links.
         """
         effects = self._pose_and_region_effects(paths, links)
         return effects + self._displacement_effects(paths, effects)
@@ -176,7 +176,7 @@ class Setup:
         return poses + self._path_effects(paths)
 
     def _path_effects(self, paths: Paths) -> Effects:
-        """The effects that depend only on the path: the losses in regions and on rough surfaces."""
+        """The effects that depend only on the path: losses in regions and at rough surfaces."""
         study, parameters, frequency = self.study, self.parameters, self.study.scene.frequency
         displaced = self._position_error_m is not None
         extra = region_effects(study.regions, self.regions, parameters, paths, frequency, displaced=displaced)
@@ -200,10 +200,10 @@ class Setup:
         return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
 
     def placed_at(self, values: Mapping[str, float], neighbours: tuple[float, ...] = ()) -> Setup:
-        """The setup with paths traced at the antenna positions that `values` of the parameters determine.
+        """The setup with paths traced at the antenna positions that the parameter values `values` determine.
 
-        The setup is unchanged if no parameter displaces antennas. Path loss is interpolated between `neighbours` on
-        each side of these positions (shares of the largest displacement). Without neighbours, path loss does not depend
+        The setup is unchanged if no parameter displaces antennas. Path loss is interpolated between these positions and
+        `neighbours` on each side (fractions of the largest displacement). Without neighbours, path loss does not depend
         on displacements.
         """
         if not any(displaces(item.name) for item in self.parameters):
@@ -249,7 +249,7 @@ class Setup:
 
     @property
     def known_antennas(self) -> tuple[Antenna, Antenna] | None:
-        """Transmit and receive antennas of an engine that exports rays; None if unstated or different between links."""
+        """Transmit and receive antennas of an engine that exports rays; None if unstated or not common to all links."""
         section = self.study.antennas
         known = section != AntennasSection() if section.known is None else section.known
         return self.radio.antennas if known and not self.study.links.mountings else None
@@ -284,7 +284,7 @@ class Setup:
 
     @cached_property
     def _loaded(self) -> dict[str, Any]:
-        """The tracer, after it has been loaded, and the digest of its files.
+        """The loaded tracer and the digest of its files; empty before loading.
 
         All setups of one scene share this dictionary.
         """
@@ -294,13 +294,13 @@ class Setup:
         return cache.files_digest(self.scene, self.study.antenna_pair)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for another process, without the loaded tracer and with an absolute path of the scene."""
+        """The state for another process, without the loaded tracer and with the absolute path of the scene."""
         state = {item.name: getattr(self, item.name) for item in fields(self)}
         return state | {"scene": replace(self.scene, path=self.scene.path.absolute())}
 
     @property
     def carriers(self) -> dict[float, dict[str, Material]]:
-        """Materials before calibration, by carrier [Hz]; empty if all links have the study's carrier."""
+        """Materials before calibration, by carrier [Hz]; empty if all links use the carrier of the study."""
         return self._materials_by_carrier
 
     @cached_property
@@ -335,7 +335,7 @@ class Setup:
         """The paths of the links: traced, read from the cache, or obtained from a ray table or an external program.
 
         A program that returns rays is called once. Links that differ only in carrier are traced once. `materials`
-        replace those of the scene, by name. `progress` is called with "tracing" after every launch.
+        override, by name, the materials of the scene. `progress` is called with "tracing" after every launch.
 
         Raises:
             InputError: The tracer cannot be used, or the scene lacks a material.
@@ -350,18 +350,19 @@ class Setup:
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
             return self._mounted(self._trace_links(self._links_in_place, scene, progress), scene)
-        # Paths do not depend on the carrier, so pairs of ends that several carriers share are traced once.
+        # Paths do not depend on the carrier, so a pair of ends that occurs at several carriers is traced once.
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
-        # `select` keeps the order of links, but `unique` sorts pairs: `rank` is a pair's index among those selected.
+        # `select` keeps the order of links, but `unique` sorts pairs; `rank` is the index of a pair among the selected
+        # links.
         rank = np.argsort(np.argsort(first))
         return self._mounted(
             take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]), scene
         )
 
     def _trace_links(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
-        """Paths of the links. If positions have errors, the power of the paths is the mean over displaced receivers."""
+        """Paths of the links. If positions have errors, the power of a link is the mean over displaced receivers."""
         errors = self._position_error_m
         if errors is None:
             return self._trace(links, scene, progress)
@@ -369,12 +370,12 @@ class Setup:
 
     @cached_property
     def _ground(self) -> Ground | None:
-        """Function that returns the height of the lowest surface, or +inf; None if heights are not above ground."""
+        """Function that returns the height of the lowest surface, or +inf; None if heights are not above the ground."""
         return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property
     def _position_error_m(self) -> NDArray[np.float64] | None:
-        """Standard deviation of receiver position errors along x and y [L], [m]; None for exact positions."""
+        """Standard deviation of receiver position errors along x and y [L], [m]; None if positions are exact."""
         stated = self.study.links.position_error_m
         if stated is None or not self.links.measured:
             return None
@@ -388,9 +389,9 @@ class Setup:
         return errors
 
     def with_position_noise(self) -> Setup:
-        """The setup with link weights that account for position errors; without such errors, the setup itself.
+        """The setup with link weights that account for position errors; the setup itself if positions are exact.
 
-        The additional variance is that of path loss over displaced receivers at the start values.
+        The additional variance is the variance of path loss over displaced receivers at the start values.
         """
         errors, links, study = self._position_error_m, self.links, self.study
         if errors is None:
@@ -409,7 +410,7 @@ class Setup:
         return self._with_tracer(replace(self, links=replace(links, weight=weight)))
 
     def _mounted(self, paths: Paths, scene: Scene, mountings: Mapping[str, Mounting] | None = None) -> Paths:
-        """The paths with the fields of antennas that differ between links, and with the materials of facades."""
+        """The paths with the fields of those antennas that differ between links, and with the materials of facades."""
         study, mountings = self.study, self.mountings if mountings is None else mountings
         paths = mount(paths, mountings) if mountings else paths
         if not study.facades:
@@ -418,7 +419,7 @@ class Setup:
 
     @cached_property
     def mountings(self) -> dict[str, Mounting]:
-        """The antennas at the ends ("tx", "rx") where they differ between links.
+        """The antennas at those ends ("tx", "rx") at which they differ between links.
 
         Raises:
             InputError: A column is missing or malformed, or names an unknown antenna.
@@ -436,7 +437,7 @@ class Setup:
             if plan.seconds > LONG_TRACE_SECONDS:
                 _LOG.warning("%s", plan.announcement(len(links)))
             paths = self.tracer.trace(links, progress, scene.materials)
-            # Store the trace only if the files have not changed since the tracer read them.
+            # The trace is stored only if the files have not changed since the tracer read them.
             if self._files_digest() == self._loaded["files"]:
                 cache.store_trace(digest, paths)
         return paths
@@ -449,7 +450,7 @@ class Setup:
         return changed
 
     def _with_tracer(self, changed: Setup) -> Setup:
-        """A changed setup with the same tracer, which is independent of links and methods."""
+        """A changed setup with the same tracer, because the tracer does not depend on links or methods."""
         changed.__dict__["_loaded"] = self._loaded
         known = {name: value for name, value in vars(self).items() if name in ("regions", "_ground")}
         changed.__dict__.update(known)
@@ -495,7 +496,7 @@ def _scene_of(study: StudyModel, frequency: float) -> Scene:
 
 
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
-    """The paths of the study's ray table, whose powers are those at the start values."""
+    """The paths of the study's ray table. The powers in the table apply at the start values."""
     from calibray.engines.rays.compile import RaySetting, compile_rays
     from calibray.engines.rays.table import RayTable, read_ray_file
 
@@ -504,7 +505,7 @@ def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material])
 
 
 def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
-    """The paths that the study's program returns, whose powers are those with `materials`."""
+    """The paths that the study's program returns. Their powers are computed with `materials`."""
     from calibray.engines.rays.export import Exporting
 
     scene = replace(setup.scene, materials={**setup.scene.materials, **materials})

@@ -52,18 +52,18 @@ class Study(StudyModel):
     Attributes:
         version: Version of the file format.
         scene: The scene and the carrier.
-        objects: Patterns of object names, by the name of the new material of these objects.
-        materials: Constants that replace those of the scene, by material name.
+        objects: Patterns of object names, by the name of the new material that these objects receive.
+        materials: Constants that override those of the scene, by material name.
         links: The measured links.
         antennas: The antennas.
         trace: Settings of the ray tracer.
-        objective: How paths combine into a path loss, and how links without a path are treated.
+        objective: How path loss is computed from the paths, and how links without a path are treated.
         parameters: The parameters by name, in the order of the values of a candidate.
-        offset: The nuisance term "offset" in its short form; None without an offset.
+        offset: The nuisance term "offset" in its short form; None if there is no offset.
         nuisance: Further nuisance terms by name; `nuisance_terms` contains all terms.
-        noise: The errors of measured links.
-        holdout: The held-out links, or None.
-        fidelity: When to trace again.
+        noise: The errors of the measured links.
+        holdout: The held-out links; None if no links are held out.
+        fidelity: The conditions under which paths are traced again.
         method: The optimizer.
         engine: The engine.
     """
@@ -90,9 +90,9 @@ class Study(StudyModel):
                 folder if None.
             overwrite: Whether to replace files in the folder that Calibray did not write.
             **sections: Sections of the study file that replace the defaults, such as ``trace={"max_depth": 5}`` or
-                ``links={"quantity": "received_power"}``. Materials, constants of a material, and antennas that are not
-                given remain those of the scene. Without `parameters`, the permittivities of all materials except air
-                and metal are calibrated.
+                ``links={"quantity": "received_power"}``. For materials, constants and antennas that are not given,
+                those of the scene are kept. Without `parameters`, the permittivities of all materials except air and
+                metal are calibrated.
 
         Returns:
             The study; `Result.apply` sets the calibrated materials in the scene.
@@ -133,12 +133,12 @@ class Study(StudyModel):
         """Links without measured values, for prediction, with the groups of the offset.
 
         Args:
-            table: Rows in the form of the study's table, or with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m]
-                in the scene frame, as in `result-links.csv`. No row is left out, and a row of a wide table becomes one
-                link per transmitter.
+            table: Rows in the format of the study's table, or with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m]
+                in the scene frame, as in `result-links.csv`. No row is left out. A row of a wide table becomes one link
+                per transmitter.
 
         Returns:
-            One link per row, with carriers if the table has the carrier column of the study.
+            One link per row, with carriers if the table contains the carrier column of the study.
 
         Raises:
             InputError: A column is missing or malformed, or a position is not finite.
@@ -146,7 +146,7 @@ class Study(StudyModel):
         links, columns = self.links, {*table.frame}
         group: str | Sequence[str] | None = self.offset_groups or None
         if columns >= {*POSITION_COLUMNS}:
-            # Tables of links that Calibray writes have one column of groups and one column of carriers.
+            # A table of links that Calibray writes has one column of groups and one column of carriers.
             if "group" in columns and not columns & {*self.offset_groups}:
                 group = "group"
             carrier = "frequency" if links.frequency not in columns else links.frequency
@@ -154,7 +154,8 @@ class Study(StudyModel):
             if own and links.value in columns and (links.heights is not None or links.position_unit != 1):
                 _LOG.warning(
                     "%s: columns tx_x to rx_z are read as metres in the scene frame; links.heights and "
-                    "links.position_unit are not applied. To apply them, rename %s in both tables and in the study",
+                    "links.position_unit are not applied. To apply these keys, rename %s in both tables and in the "
+                    "study",
                     table.source, ", ".join(sorted(own)),
                 )  # fmt: skip
             return links_from_table(table, group, carrier if links.frequency else None)
@@ -176,9 +177,9 @@ class Study(StudyModel):
         return links_from_table(table, group, links.frequency, steps=steps, tx=links.tx, rx=links.rx)
 
     def _freed_for_join(self, table: SourceTable, steps: Preparation) -> SourceTable:
-        """The table with new names for columns that the study's links got from the table of transmitters.
+        """The table, with new names for columns that the study's links received from the table of transmitters.
 
-        Otherwise the joined columns would get other names, because the table's columns keep theirs.
+        Without the new names, the joined columns would be renamed, because the columns of the table keep their names.
         """
         if steps.transmitters is None:
             return table
@@ -187,7 +188,8 @@ class Study(StudyModel):
         joined = shared - {*read_table(self.links_path).frame} if shared else shared
         if joined:
             _LOG.warning(
-                "%s: column %s is ignored, because the calibration took it from %s; rename it to avoid this warning",
+                "%s: column %s is ignored, because the calibration took this column from %s; to avoid this warning, "
+                "rename the column",
                 table.source, ", ".join(sorted(joined)), self.transmitters_path,
             )  # fmt: skip
         return replace(table, frame=table.frame.rename(columns={name: f"input_{name}" for name in joined}))
@@ -232,7 +234,7 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 VALUE: Final = "measured"
 AIR: Final = 1.1
-"""Largest permittivity that counts as air; that of any other ITU-R P.2040 material is at least 1.26 (ceiling board)."""
+"""Largest permittivity that counts as air; all other ITU-R P.2040 materials have at least 1.26 (ceiling board)."""
 
 LARGEST_PERMITTIVITY: Final = 15.0
 """Default upper bound of a calibrated permittivity, more than twice the largest permittivity of a building material in
@@ -240,7 +242,7 @@ ITU-R P.2040."""
 
 
 METAL: Final = 1e6
-"""Smallest conductivity of a material that counts as metal [S/m]; ITU-R P.2040 has 1e7. Metal reflects nearly all
+"""Smallest conductivity [S/m] of a material that counts as metal; ITU-R P.2040 states 1e7. Metal reflects nearly all
 power at any permittivity."""
 
 
@@ -268,7 +270,7 @@ def _write_live_study(
 
     if "scene" in sections:
         raise InputError(
-            "scene: the carrier is that of the scene in memory; set its attribute frequency instead"
+            "scene: the carrier is that of the scene in memory; set the attribute frequency of this scene instead"
         )
     live = LiveScene.of(scene)
     links = dict(sections.get("links", {}))
@@ -290,7 +292,7 @@ def _write_live_study(
         end: asdict(antenna) | {"orientation": list(antenna.orientation)}
         for end, antenna in zip(ends, live.antennas, strict=True)
     }
-    # A scattering coefficient of 0 is Sionna RT's default; stated here, it would count as exact.
+    # The default scattering coefficient of Sionna RT is 0; a 0 stated in the study would count as exact.
     materials = {
         name: {
             key: value for key, value in constants[name].items() if value or key != "scattering_coefficient"
@@ -306,7 +308,7 @@ def _write_live_study(
             f"{name}.relative_permittivity": {"bounds": default} for name, default in bounds.items()
         },
         **sections,
-        # What a section does not state remains as in the scene.
+        # Keys that a section does not state keep the values of the scene.
         "materials": materials | {name: _stated(materials.get(name, {}), own) for name, own in given.items()},
         "antennas": antennas | {"known": True, **sections.get("antennas", {})},
         "links": {"file": "links.csv", **ends, "value": VALUE, **power, **links},
@@ -314,7 +316,7 @@ def _write_live_study(
 
 
 def _stated(constants: Mapping[str, Any], given: Any) -> Any:
-    """The constants of a material in a scene, replaced where the user gives constants or an ITU-R P.2040 material."""
+    """The constants of a material in a scene, overridden by the constants or the ITU-R P.2040 material of the user."""
     if not isinstance(given, Mapping):
         return given
     law = {"relative_permittivity", "conductivity"} if "itu" in given else set[str]()
@@ -322,13 +324,13 @@ def _stated(constants: Mapping[str, Any], given: Any) -> Any:
 
 
 def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
-    """A table with one row per measured value and the names of both ends."""
+    """A table with one row per measured value, including the names of both ends."""
     values = _matrix(live, measured)
     tx, rx = (np.array(list(ends.values())) for ends in (live.tx, live.rx))
     row, column = np.nonzero(~np.isnan(values))
     if not len(row):
         raise InputError(
-            "measured: no value is a number; give a value for each transmitter and receiver, or NaN where nothing was "
+            "measured: contains no number; give a value for each transmitter and receiver, or NaN where nothing was "
             "measured"
         )
     table = pd.DataFrame(np.hstack([tx[row], rx[column]]), columns=list(POSITION_COLUMNS))
@@ -341,7 +343,7 @@ def _links(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> pd.DataFrame:
 
 
 def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.float64]:
-    """Measured values [tx, rx] in the order of the scene; NaN where nothing was measured."""
+    """Measured values [tx, rx] in the order of the scene. Values that were not measured are NaN."""
     if isinstance(measured, pd.DataFrame):
         for what, labels, names in (("row", measured.index, live.tx), ("column", measured.columns, live.rx)):
             kind = "transmitter" if what == "row" else "receiver"
@@ -356,8 +358,8 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
         measured = measured.reindex(index=list(live.tx), columns=list(live.rx)).to_numpy()
     elif isinstance(measured, str | Path):
         raise InputError(
-            f"measured: is the text {shortened(str(measured))!r}, must be values; read the file first, for instance "
-            "with pandas.read_csv(file, index_col=0)"
+            f"measured: is the text {shortened(str(measured))!r}, must be the measured values; read the file first, "
+            "for instance with pandas.read_csv(file, index_col=0)"
         )
     elif hasattr(measured, "columns"):
         raise InputError(

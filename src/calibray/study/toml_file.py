@@ -1,4 +1,4 @@
-"""Processing of study files: TOML, environment variables in file names, and keys of several engines."""
+"""Reads and writes study files: TOML, environment variables in file names, and keys of several engines."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def read_content(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8 text; save the file as UTF-8") from None
     except (ValueError, RecursionError) as error:
-        # Besides malformed TOML: a number with thousands of digits, or lists nested thousands of levels deep.
+        # The cause can also be a number with thousands of digits, or lists nested thousands of levels deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
 
 
@@ -51,7 +51,7 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     """The text of a study file. Comments state the `reasons` for assumptions, by dotted name of the section or key.
 
     Raises:
-        InputError: A name has characters that TOML cannot contain.
+        InputError: A name contains characters that TOML cannot represent.
     """
     document, text, agrees = tomlkit.document(), "", False
     try:
@@ -61,7 +61,7 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
         agrees = tomllib.loads(text) == _with_lists(content)
     except ValueError:  # a lone surrogate, which no TOML file can contain
         pass
-    # Whatever the names in a table, the file must state exactly what was drafted.
+    # For any names in a table, the file must state exactly the content of the draft.
     if not agrees:
         raise InputError(
             "draft: the name of a column or group cannot be written in TOML; rename the column or group in the table"
@@ -94,12 +94,12 @@ def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
 
 
 def _commented(item: Any, reason: str | None) -> Any:
-    """An item with a comment on one line; text after a line break would be read as TOML."""
+    """An item with a comment on one line, because text after a line break would be read as TOML."""
     return item.comment(printable(reason)) if reason else item
 
 
 def _item(value: Any) -> Any:
-    """A value in TOML, with inline tables. Large numbers are written as 3.5e9, for instance, instead of 3500000000."""
+    """A value in TOML, with inline tables. Large numbers are written in the form 3.5e9 instead of 3500000000."""
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         table.update({key: _item(part) for key, part in value.items()})
@@ -118,7 +118,7 @@ def _item(value: Any) -> Any:
 
 
 def _with_lists(value: Any) -> Any:
-    """A value with lists instead of tuples, as in parsed TOML."""
+    """A value in which tuples are replaced by lists, as in parsed TOML."""
     if isinstance(value, Mapping):
         return {key: _with_lists(part) for key, part in value.items()}
     return [_with_lists(part) for part in value] if isinstance(value, list | tuple) else value
@@ -135,7 +135,7 @@ def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
 
 
 def expand(text: str, environment: Mapping[str, str]) -> str:
-    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` with a default for unset or empty variables.
+    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` for unset or empty variables.
 
     Raises:
         InputError: A variable without a default is not set, or a ``${`` is malformed.
@@ -151,7 +151,7 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
             return environment[name]
         if default is None:
             raise InputError(
-                f"environment variable {name} is not set; set the variable, or write ${{{name}:-DEFAULT}}"
+                f"environment variable {name} is not set; set the variable or write ${{{name}:-DEFAULT}}"
             )
         return default
 
@@ -164,11 +164,11 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
 def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
     """Split the table ``[engine]`` into the keys of the named engine and the keys of other engines.
 
-    A study can state the command of a program and use replay; `calibray run --engine command` then calls the program.
+    A study can use replay and also state the command of a program, which `calibray run --engine command` then calls.
 
     Raises:
-        InputError: The value of a key of another engine is invalid. Or engines share the key, and only an engine that
-            the table does not describe accepts the value.
+        InputError: The value of a key of another engine is invalid, or several engines share the key and only an engine
+            that the table does not describe accepts the value.
     """
     # The study's own validation rejects a value that is not a table or does not name an engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
@@ -182,7 +182,7 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
             if key in section.model_fields
         }
         fitting = [kind for kind, fault in faults.items() if fault is None]
-        # Engines may share a key, such as `rays`, for values of different types.
+        # Several engines may use the same key, such as `rays`, for values of different types.
         if faults and (key not in own or (faults[name] is not None and fitting)):
             if not fitting:
                 raise InputError(
@@ -205,7 +205,7 @@ def is_shared(key: str) -> bool:
 
 
 def _described(kind: str, content: Mapping[str, Any]) -> bool:
-    """Whether the table states a key that only this engine has; the default engine needs none."""
+    """Whether the table states a key that only this engine has; always True for the default engine."""
     own = KINDS[kind].model_fields
     return kind == DEFAULT or any(key in own and not is_shared(key) for key in content)
 

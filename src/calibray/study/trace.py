@@ -62,14 +62,14 @@ def trace(
     """Find the paths of every link and compile them.
 
     Args:
-        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a `Scene`. Alternatively, a study, which states
+        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a `Scene`. Alternatively, a study that states
             links, carrier, antennas and settings. The trace of a study is cached.
         measurements: The links. Their measured values and carriers are not used (see `Paths.at` for other carriers).
             With a study, these links replace those of the study.
         frequency: Carrier frequency [Hz].
-        tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
+        tx_antenna: Transmit antenna, as an `Antenna` or as a mapping of its attributes.
         rx_antenna: Receive antenna, in the same form.
-        materials: Constants that replace those of the scene or the start values of a study, by material name. With a
+        materials: Constants that override those of the scene or the start values of a study, by material name. With a
             study or a `Scene`, each value must be a `Material`.
         progress: Called with ("tracing", receivers traced, number of receivers) after every launch.
         **settings: The attributes of `TraceSettings`.
@@ -78,8 +78,8 @@ def trace(
         The path program; `links_without_path` lists the links without a path.
 
     Raises:
-        InputError: The study, the scene, an antenna, a setting or a position cannot be used. An argument is missing, or
-            is given although the study states its value.
+        InputError: The study, the scene, an antenna, a setting or a position cannot be used. A required argument is
+            missing, or an argument is given although the study states its value.
         EngineError: The paths do not fit into memory.
     """
     if isinstance(scene, Study):
@@ -140,27 +140,27 @@ def read_rays(
 ) -> Paths:
     """Read the paths of any engine (docs/reference/ray-table.md).
 
-    If the table contains the powers of the paths, the path program has a correction. With the materials of the scene,
-    or the start values of the study, every path then has the power stated in the table.
+    If the table contains the powers of the paths, the path program includes a correction. With this correction, every
+    path has the power stated in the table for the materials of the scene or the start values of the study.
 
     Args:
         rays: The ray table: a .csv, .parquet, .json or .h5 file, or a DataFrame of its rows. Alternatively, the paths
-            of another program: a .p2m file of Wireless InSite or a list or folder of them, the folder of an AODT run or
-            a DeepMIMO scenario, or the `Paths` of Sionna RT.
+            of another program: one or several .p2m files of Wireless InSite (a file, list or folder), the folder of an
+                AODT run or a DeepMIMO scenario, or the `Paths` of Sionna RT.
         scene: Mitsuba XML file, `sionna:NAME`, or a `Scene`, with the constants that the engine used. Alternatively, a
-            study, which states carrier and links and must have the start values that the engine used.
-        frequency: Carrier frequency [Hz]; only without a study.
-        antennas: Transmit and receive antennas that the engine used. By default, these are the antennas that the study
-            states. Without stated antennas, the correction includes the antenna gains.
+            study that states carrier and links. Its start values must be those that the engine used.
+        frequency: Carrier frequency [Hz]; required unless `scene` is a study.
+        antennas: Transmit and receive antennas that the engine used. By default, the antennas that the study states are
+            used. If no antennas are stated, the correction includes the antenna gains.
         axes: Axes of the table along x, y and z of the scene, such as "x -z y" for a table with an upward y axis.
-        tx_power_dbm: Transmitted power [dBm], for a file that states received power (Wireless InSite).
+        tx_power_dbm: Transmitted power [dBm]; needed for a file that states received power (Wireless InSite).
 
     Returns:
-        The path program, with the links of the study. Without a study, it has the links of the table, identified by
-        label or position. Labels are sorted naturally, with `rx2` before `rx10`.
+        The path program, with the links of the study. Without a study, the path program has the links of the table,
+        identified by label or position. Labels are sorted naturally, with `rx2` before `rx10`.
 
     Raises:
-        InputError: The table, the scene or an antenna cannot be used or is inconsistent with the others.
+        InputError: The table, the scene or an antenna cannot be used, or they are inconsistent with each other.
 
     Example:
         >>> from calibray.scenarios import demo_study_path
@@ -197,7 +197,7 @@ def read_rays(
 
 
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:
-    """Write paths as a ray table for other engines and programs; powers are computed with the materials of `paths`.
+    """Write paths as a ray table for other engines and programs. Powers are computed with the materials of `paths`.
 
     The file name must end in .csv, .parquet, .json or .h5. With `overwrite`, even a file that Calibray did not write is
     replaced.

@@ -33,10 +33,10 @@ from calibray.study.model import StudyModel
 from calibray.validation import models
 
 SEARCHES: Final = 16
-"""Number of local searches for the model's optimum, in addition to the search from the calibrated optimum."""
+"""Number of local searches for the optimum of the model, in addition to the search from the calibrated optimum."""
 
 MOST_ERRORS: Final = 400
-"""Largest number of absolute errors that are stored with the model; if there are more, quantiles are stored instead."""
+"""Maximum number of absolute errors stored with the model; if there are more errors, quantiles are stored instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class HeldOutResiduals:
         basis: Description of the links to which the residuals belong.
         links: Number of these links, or degrees of freedom if they are calibration links.
         errors_db: The residuals on held-out links [n], [dB]; empty if the residuals belong to calibration links.
-        blocks: Standard deviations within and between blocks; None if no links, or too few links, were held out.
+        blocks: Standard deviations within and between blocks; None if too few or no links were held out.
     """
 
     rms_db: float | None
@@ -60,13 +60,14 @@ class HeldOutResiduals:
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """The prediction model with its path loss at the study's links.
+    """The prediction model, with its path loss on the links of the study.
 
     Attributes:
         model: The model.
         materials: Materials of the scene with the model's parameters; None if the model uses no scene.
-        path_loss_db: Path loss of the model, with nuisances [links], [dB].
-        scene_db: Path loss of the model's scene alone, or of the calibrated scene if the model uses none [links], [dB].
+        path_loss_db: Path loss of the model, including nuisances [links], [dB].
+        scene_db: Path loss [links], [dB], of the scene without nuisances: the model's scene, or the calibrated scene if
+            the model uses no scene.
     """
 
     model: PredictionModel
@@ -84,18 +85,19 @@ def fit_prediction_model(
 ) -> FittedModel:
     """Fit the chosen model to all links that have a nonzero weight.
 
-    An average uses the scene of its first model, and also stores the parameters of the second, if it has any.
+    An average uses the scene of its first model and also stores the parameters, if any, of its second model.
 
     Args:
         problem: The problem.
         trail: The search that solved the problem.
         name: Name of the model; see `Model`.
         residuals: Residuals of the model on new links.
-        retrace_gap_db: Change in path loss of every link when the paths of the search are replaced by paths traced with
-            the calibrated materials [L], [dB]; None if the paths were not traced again.
+        retrace_gap_db: Change in path loss of every link [L], [dB], from the paths of the search to paths traced with
+            the calibrated materials; None if the paths were not traced again.
 
     Returns:
-        The fitted model. Predictions and exports trace with its materials, so its values contain this change.
+        The fitted model. Predictions and exports trace with the materials of this model, so its path loss includes this
+        change.
     """
     parameters, study = problem.parameters, problem.setup.study
     uses_scene = name not in WITHOUT_MATERIALS
@@ -160,7 +162,7 @@ class FittedVariant:
 
 
 def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
-    """Fit a variant; a search, if needed, starts from the calibrated optimum and from new starting points."""
+    """Fit a variant. If a search is needed, it starts from the calibrated optimum and from new starting points."""
     if name == Model.INITIAL:
         objective = models.initial_objective(problem.objective, problem.setup)
         return FittedVariant(problem.parameters.start, objective, problem.before)
@@ -174,7 +176,7 @@ def fit_variant(problem: Problem, trail: Trail, name: Model) -> FittedVariant:
 
 
 def fit_without_materials(problem: Problem, name: str) -> tuple[tuple[FittedTerm, ...], NDArray[np.float64]]:
-    """Terms of a log-distance model that is fitted to the links with nonzero weight, and its path loss [L], [dB]."""
+    """Terms of a log-distance model fitted to the links with nonzero weight, and path loss of the model [L], [dB]."""
     study, links = problem.setup.study, problem.setup.links
     make = models.log_distance if name == Model.LOG_DISTANCE else models.obstructed
     model = make(links, problem.objective, models.without_scene(study, links))
@@ -187,8 +189,9 @@ def averaged_terms(
 ) -> tuple[FittedTerm, ...]:
     """The weighted mean of the terms of two models; the second model has all terms of the first.
 
-    The first model has the given weight. Coefficients and spreads of a term that it lacks are multiplied by the weight
-    of the second. If a group has no coefficient in one model, that of the other model is used.
+    The first model has the given weight. If the first model lacks a term, the coefficients and spread of the term are
+    multiplied by the weight of the second model. If a group has a coefficient in only one model, this coefficient is
+    used.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:
@@ -197,7 +200,7 @@ def averaged_terms(
             others = known[term.name].coefficients
         elif spread_db is not None:
             spread_db = (1.0 - weight) * spread_db
-        # The coefficients of each model, completed by those of the other.
+        # Coefficients missing in one model are taken from the other model.
         first, second = {**term.coefficients, **others}, {**others, **term.coefficients}
         means = {label: weight * first[label] + (1.0 - weight) * second[label] for label in second}
         averaged.append(replace(term, coefficients=means, spread_db=spread_db))
@@ -205,10 +208,10 @@ def averaged_terms(
 
 
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
-    """The terms of the log-distance model with obstruction, with the mean of the prior added to the loss out of sight.
+    """The terms of the log-distance model with obstruction, in which the loss out of sight includes the prior mean.
 
-    The fit treats that mean as known, even if no link out of sight has a nonzero weight. A nuisance that the study
-    declares for the same column has no such prior.
+    The fit treats the prior mean as known, even if no link out of sight has a nonzero weight. A nuisance that the study
+    declares for the same column does not have this prior.
     """
     if any(term.by == OUT_OF_SIGHT for term in study.nuisance.values()):
         return terms
@@ -221,13 +224,13 @@ def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[F
 
 
 def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
-    """Absolute errors in the form in which they are stored with a model.
+    """Absolute errors, in the form that is stored with a model.
 
     Args:
         absolute_errors: The errors, ascending [n], [dB].
 
     Returns:
-        All errors, or `MOST_ERRORS` quantiles if there are more errors, ascending.
+        All errors in ascending order, or `MOST_ERRORS` quantiles if there are more errors.
     """
     if len(absolute_errors) > MOST_ERRORS:
         absolute_errors = np.quantile(absolute_errors, (np.arange(MOST_ERRORS) + 0.5) / MOST_ERRORS)
@@ -248,12 +251,12 @@ def fitted_terms(
         The terms. Groups without fitted links are left out.
     """
     coefficients = objective.completed(path_loss_db[None])[0]
-    # A group whose links do not determine its coefficient is still fitted with one.
+    # The fit still gives a coefficient to a group whose links do not determine it.
     has_links = np.asarray(abs(objective.nuisance.design[objective.weight > 0]).sum(axis=0)).ravel() > 0
     used = objective.determined | has_links & (coefficients != 0)
     by_term, terms = objective.nuisance.by_term(coefficients, used), []
     spreads = {term.around: term.prior for term in objective.nuisance.terms if term.around}
-    # A random effect is one term, with the groups of its deviations.
+    # A random effect is a single term with the groups of the deviations.
     grouped = {term.around or term.name: term for term in objective.nuisance.terms}
     for name, term in grouped.items():
         if term.labels == ("",):

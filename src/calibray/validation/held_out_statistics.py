@@ -1,11 +1,11 @@
-"""Statistics of held-out errors: spatial blocks, comparison of two models, and width of a prediction interval.
+"""Statistics of held-out errors: spatial blocks, comparison of two models, and widths of prediction intervals.
 
 The interval is conformal: among n + 1 exchangeable errors, a new error has every rank with the same probability. The
 absolute value of a new error is therefore at most the ((n + 1) p)-th smallest of the n observed absolute errors with
 probability p, regardless of their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random
-World, 2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a
-Gaussian, so an interval from their root mean square would be too wide at 90 %. If there are few errors, the largest
-ones are too uncertain, and Student's t is used instead.
+World, 2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Link errors have heavier tails than a
+Gaussian distribution, so an interval computed from their RMS value would be too wide at 90 %. If there are few errors,
+their largest values are too uncertain, and Student's t distribution is used instead.
 
 For further observables, one baseline is linear in distance for times of flight, and linear in the logarithm of distance
 otherwise. Models and baselines include device biases, which are fitted to the links that are not held out.
@@ -40,34 +40,33 @@ Errors = Mapping[Any, NDArray[np.float64]]
 """Residuals [n], [dB], by model; a key is a `Model` or its name."""
 
 CLUSTER_LINKS: Final = 4
-"""Number of neighbouring links that are resampled together, because they share part of their noise."""
+"""Number of neighbouring links that are resampled together, because neighbours share part of their noise."""
 
 MOST_CLUSTERS: Final = 1000
-"""Largest number of clusters; if there are more links, clusters are larger."""
+"""Maximum number of clusters; larger data sets have larger clusters instead."""
 
 RESAMPLES: Final = 2000
 
 LEAST_GAIN: Final = 0.05
-"""Smallest relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases came from one
-block, and the fitted model was up to 3 dB worse on separately held-out clusters. With planted misfits, every decrease
-was larger."""
+"""Minimum relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases came from a
+single block, and the fitted model was up to 3 dB worse on separately held-out clusters. With simulated misfits, every
+decrease was larger."""
 
 REACHED: Final = 0.9
-"""Share of the held-out links that are at most `BlockErrors.reach_m` from a link outside their block."""
+"""Fraction of the held-out links that are at most `BlockErrors.reach_m` from a link outside their own block."""
 
 AVERAGE_LINKS: Final = 8
-"""Weight of the mean square error of all links in the estimate for links out of sight, as a number of links. A few
-links out of sight contain little information about their errors."""
+"""Weight, as a number of links, of the mean square error of all links in the estimate for links out of sight. A few
+links out of sight give little information about their own errors."""
 
 FEWEST_FOR_RANKS: Final = 40
-"""Smallest number of errors whose ranks determine an interval; for fewer errors, Student's t distribution is
-assumed."""
+"""Minimum number of errors whose ranks determine an interval; for fewer errors, Student's t distribution is assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """Divide positions [n, 2 or 3], [m], into compact blocks of about equal size, numbered from 0 [n].
 
-    The largest block is halved across its longer side until there are enough blocks, at most n.
+    The largest block is halved across its longer side until there are `count` blocks, or n if `count` is larger.
 
     Example:
         >>> spatial_blocks(np.array([[0.0, 0.0], [9.0, 0.0], [1.0, 0.0], [8.0, 0.0]]), 2).tolist()
@@ -97,7 +96,7 @@ def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]
         [0, 0, 0, 1]
     """
     _, first, place = np.unique(position[:, :2], axis=0, return_index=True, return_inverse=True)
-    # Places keep the order of the links, which decides between equal coordinates.
+    # Distinct positions keep the order of the links, because this order decides between equal coordinates.
     order = np.argsort(first)
     block = np.empty(len(first), dtype=np.int64)
     block[order] = spatial_blocks(position[first[order], :2], count)
@@ -108,7 +107,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
     The standard error of the difference is estimated by resampling clusters of links with neighbouring positions [n,
-    3], [m]. Both models use the same clusters. Links with a non-finite residual are left out.
+    3], [m]. The same clusters are used for both models. Links with a non-finite residual are left out.
     """
     table = np.stack([errors, *baselines.values()])
     finite = np.isfinite(table).all(axis=0)
@@ -117,7 +116,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
         return Judgement(0, np.nan, next(iter(baselines)), np.nan, None, 0)
     rmse = np.sqrt(square.mean(axis=1))
     best = 1 + int(np.argmin(rmse[1:]))
-    # Two links or more make at least two clusters: one cluster gives no standard error.
+    # Two or more links form at least two clusters, because a single cluster gives no standard error.
     clusters = min(max(count // CLUSTER_LINKS, min(count, 2)), MOST_CLUSTERS)
     cluster = spatial_blocks(position[finite], clusters)
     size = np.bincount(cluster)
@@ -125,7 +124,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
     resampled = np.random.default_rng(0).integers(len(size), size=(RESAMPLES, len(size)))
     # Clusters differ in size, so total sums of squares are divided by the total number of links.
     model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
-    # Resampling k clusters underestimates the variance over new clusters by the factor (k - 1) / k.
+    # Resampling k clusters underestimates the variance between new clusters by the factor (k - 1) / k.
     error = None
     if len(size) > 1:
         error = float(np.std(baseline_rmse - model_rmse) * np.sqrt(len(size) / (len(size) - 1)))
@@ -134,7 +133,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
 
 
 def choose(errors: Errors, position: NDArray[np.float64]) -> str:
-    """Choose the model for predictions by held-out residuals [n], [dB], which include those of `Model.INITIAL`.
+    """Choose the prediction model by held-out residuals [n], [dB], which must include those of `Model.INITIAL`.
 
     The initial materials are kept unless another model is better by more than both the bootstrap error of the
     difference and `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
@@ -150,10 +149,10 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
-    """The prediction model: the model chosen by held-out residuals, or the average that replaces it, if any.
+    """The prediction model: the model chosen by held-out residuals, or the average (if any) that replaces this model.
 
-    A log-distance model is not averaged if this increases its RMSE by more than `LEAST_GAIN`, because the scene may be
-    much worse.
+    A log-distance model is not averaged if averaging increases the RMSE by more than `LEAST_GAIN`, because the scene
+    may be a much worse model.
     """
     name = choose(errors, position)
     average = AVERAGE_OF.get(name, name)
@@ -165,7 +164,7 @@ def predicting(errors: Errors, position: NDArray[np.float64]) -> str:
 
 
 def least(errors: Errors, names: tuple[str, ...]) -> str:
-    """The model with the lowest RMSE among those named that have residuals [n], [dB]."""
+    """The model with the lowest RMSE among those `names` for which there are residuals [n], [dB]."""
     return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
 
 
@@ -177,10 +176,10 @@ def two_levels(
 ) -> BlockErrors | None:
     """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
 
-    Each new street has its own error, so a few blocks contain less information than their number of links suggests.
-    `position` [n, k], [m], contains the positions of the links' ends. `fitted` [m, k] contains the positions of the
-    links to which the models were fitted; if None, these are the links of the other blocks. The result is None if there
-    are fewer than two blocks, or no more links than blocks.
+    Each new street has its own error, so a few blocks contain less information than the number of links suggests.
+    `position` [n, k], [m], contains the positions of both ends of each link. `fitted` [m, k] contains the positions of
+    the links to which the models were fitted; if None, these are the links of the other blocks. The result is None if
+    there are fewer than two blocks, or no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -191,10 +190,10 @@ def two_levels(
     count, links = len(size), len(errors)
     if count < 2 or links <= count:
         return None
-    # The mean over a block's links has the variance within / size about the error that they share.
+    # The mean over the links of a block has the variance within / size around the common error of the block.
     mean = np.bincount(index, errors) / size
     within = float(np.sum((errors - mean[index]) ** 2)) / (links - count)
-    # Predictions do not correct a block's mean error, so its deviation is measured from zero.
+    # Predictions do not correct the mean error of a block, so its deviation is measured from zero.
     between = max(float(np.mean(mean**2 - within / size)), 0.0) * (1.0 + 1.0 / count)
     distance = np.empty(links)
     for number in range(count):
@@ -205,10 +204,10 @@ def two_levels(
 
 
 def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) -> float:
-    """Root mean square error of links out of sight divided by that of all links, from residuals [n], [dB].
+    """RMS error of links out of sight, divided by the RMS error of all links, from residuals [n], [dB].
 
-    The ratio is at least 1, so that links in sight keep the interval of all links. With few links out of sight, it is
-    shrunk towards 1 (`AVERAGE_LINKS`).
+    The ratio is at least 1, so links in sight keep the interval of all links. If few links are out of sight, the ratio
+    is shrunk towards 1 (`AVERAGE_LINKS`).
 
     Example:
         >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
@@ -221,7 +220,7 @@ def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) 
 
 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:
-    """Half the width [dB] of the interval that contains a new error with probability `level`.
+    """Half-width [dB] of the interval that contains a new error with probability `level`.
 
     Absolute errors are in ascending order [n], [dB].
 
@@ -235,7 +234,7 @@ def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> f
     student_t = float(stdtrit(count, (1 + level) / 2)) * rms
     if count < FEWEST_FOR_RANKS:
         return student_t
-    # The observed errors are too few for an upper limit at this level.
+    # There are too few observed errors for an upper limit at this level.
     if rank > count:
         return max(student_t, float(absolute_errors[-1]))
     return float(np.interp(rank, np.arange(1, count + 1), absolute_errors))
@@ -248,10 +247,10 @@ MODELS: Final = ("calibrated", "mean", "law of distance")
 def held_out_gaps(
     problem: Problem, best: NDArray[np.float64], held_out: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
-    """Predicted minus measured values of every observable on held-out links, by `MODELS` [3, L].
+    """Predicted minus measured values of every observable on held-out links, for the three `MODELS` [3, L].
 
-    The unit is that of the observable. Biases are fitted to the other links. The optimum `best` [d] is in the
-    parameters' units. The values of a link that is not judged are NaN.
+    Each value has the unit of the observable. Biases are fitted to the other links. The optimum `best` [d] is in the
+    parameters' units. The values of links that are not judged are NaN.
     """
     if not problem.observed:
         return {}
@@ -271,7 +270,7 @@ def held_out_gaps(
 def observable_errors(
     gaps: Mapping[str, NDArray[np.float64]], study: StudyModel
 ) -> dict[str, ObservableErrors]:
-    """RMS errors of the models by observable, from gaps [3, L]; observables without a judged link are left out."""
+    """RMS errors of the models by observable, from gaps [3, L]. Observables without a judged link are omitted."""
     errors = {}
     for name, gap in gaps.items():
         judged = gap[:, np.isfinite(gap).all(axis=0)]
@@ -291,10 +290,10 @@ def _law(observable: Observed, links: Measurements) -> NDArray[np.float64]:
 def _with_biases(
     observable: Observed, feature: NDArray[np.float64], weight: NDArray[np.float64], *, slope: bool
 ) -> NDArray[np.float64]:
-    """The feature, or a fitted multiple of it, plus fitted biases; groups without used links have the mean bias."""
+    """The feature, or a fitted multiple of it, plus fitted biases. Groups without used links get the mean bias."""
     used = observable.used(weight)
     used = used[np.isfinite(feature[used])]
-    # The model has a bias only where the study states one; the mean and the law always have a constant.
+    # The model has a bias only if the study states a bias; the mean and the law always have a constant.
     constant = slope or not np.any(feature)
     if observable.labels:
         groups = np.unique(observable.group[used])

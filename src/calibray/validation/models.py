@@ -1,12 +1,12 @@
 """The models that validation compares: baselines without paths, and variants of the study's model that use the scene.
 
-The baselines are the log-distance model, the same model with the obstruction of the direct line, and kriging.
+The baselines are the log-distance model, the log-distance model with obstruction of the direct line, and kriging.
 
 The variants are the study's own model, the initial materials, the model with a prior around the initial values, and the
-model with this prior and offsets per transmitter and out of sight. These are the models that an engineer would try by
+model with this prior and with offsets per transmitter and for links out of sight. An engineer would try these models by
 hand. The best variant differs between campaigns, so the choice is based on held-out links (`validate.py`). Both offsets
-have a prior around zero, which keeps them small where the links do not require them. A single variant with both offsets
-is therefore sufficient. Further variants make the choice worse (docs/measurements/predictions.md).
+have a prior around zero, which keeps the offsets small unless the links require them. A single variant with both
+offsets is therefore sufficient. Further variants make the choice worse (docs/measurements/predictions.md).
 """
 
 from __future__ import annotations
@@ -46,30 +46,30 @@ from calibray.study.mounting import direct_gain
 from calibray.uncertainty.residual_correlation import fit_correlation
 
 OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
-"""Mean and standard deviation of the prior of the loss out of sight [dB]: 3GPP TR 38.901 (UMi) gives 10 dB at 20 m and
-20 dB at 100 m. If all fitted links are in sight, only the prior contains information about this loss."""
+"""Mean and standard deviation [dB] of the prior of the loss out of sight. 3GPP TR 38.901 (UMi) gives 10 dB at 20 m and
+20 dB at 100 m. If all fitted links are in sight, only the prior gives information about this loss."""
 
 WALL_DB: Final = 2.0
-"""Standard deviation of the zero-mean prior for the loss per wall crossed [dB]. Indoors, the loss of walls dominates
-with any prior. Outdoors, waves travel around buildings; with 5 dB, the error on one held-out cluster in Boulder was 17
-dB."""
+"""Standard deviation of the zero-mean prior for the loss per wall crossed [dB]. Indoors, walls dominate path loss,
+whatever the prior. Outdoors, waves travel around buildings. With a standard deviation of 5 dB, the error on one
+held-out cluster in Boulder was 17 dB."""
 
 ROUNDS: Final = 4
-"""Number of rounds in which the errors, and then the losses with their priors, are fitted. Further rounds change
-results by 0.01 dB."""
+"""Number of rounds, each of which fits the errors and then the losses with their priors. Further rounds change results
+by 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
-"""Lower limit of the error of the log-distance model that sets the weight of the priors [dB]."""
+"""Lower limit [dB] of the error of the log-distance model; this error sets the weight of the priors."""
 
 MOST_KRIGED: Final = 1000
-"""Largest number of links for kriging: the fit of the correlation factorizes their covariance a few hundred times."""
+"""Maximum number of links for kriging. The fit of the correlation factorizes their covariance a few hundred times."""
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """The part of path loss [links], [dB], that requires no scene: its increase with the carrier, minus antenna gains.
+    """The part of path loss [links], [dB], that requires no scene: the increase with frequency, minus antenna gains.
 
     Path loss increases by 20 log10(f / f0) from the study's carrier f0, as in free space. The gains are those of the
-    stated antennas along the straight line, in the directions that the columns of the links state.
+    stated antennas along the straight line; columns of the links state their directions.
 
     Raises:
         InputError: A column of the antennas is missing or malformed.
@@ -80,7 +80,7 @@ def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]
 
 
 class Baseline(NamedTuple):
-    """A model without paths: all its unknowns are nuisance coefficients, which the links with nonzero weight determine.
+    """A model without paths. All unknowns are nuisance coefficients, which the links with nonzero weight determine.
 
     Attributes:
         objective: The model as an objective.
@@ -91,14 +91,14 @@ class Baseline(NamedTuple):
     known_db: NDArray[np.float64]
 
     def path_loss_db(self) -> NDArray[np.float64]:
-        """Path loss at all links [links], [dB]; groups without links of nonzero weight get the mean of the others."""
+        """Path loss on all links [links], [dB]. Groups without links of nonzero weight get the mean of other groups."""
         return self.objective.with_nuisance(self.known_db)
 
 
 def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
-    """The log-distance model with the study's nuisances; an offset per group becomes an intercept per group.
+    """The log-distance model with the nuisances of the study. An offset per group becomes an intercept per group.
 
-    The weights of `objective`, the study's objective, select the fitted links; `known_db` is the result of
+    The weights of `objective`, the objective of the study, select the fitted links. `known_db` is the result of
     `without_scene` [links], [dB].
 
     Raises:
@@ -106,8 +106,8 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
     """
     if np.count_nonzero(objective.weight) < 2:
         raise EngineError("the log-distance model requires at least two calibration links")
-    # Bounds and priors of an offset or a slope do not apply to the law's intercept and slope; groups may deviate from
-    # these as much as the study allows.
+    # Bounds and priors of an offset or a slope do not apply to the intercept and slope of the law. Groups may deviate
+    # from the intercept and slope as far as the study allows.
     terms = [
         replace(term, bounds=UNBOUNDED, prior=np.inf if term.labels == ("",) else term.prior)
         if term.by in (CONSTANT, LOG_DISTANCE)
@@ -119,20 +119,20 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
         if (by, ("",)) not in present:
             terms.append(make_term(links, _free_name(by, terms), by))
     nuisance = Nuisance(len(links), tuple(terms))
-    # A model without paths reaches every link, so the ceiling does not apply.
+    # A model without paths predicts path loss for every link, so the ceiling does not apply.
     return Baseline(replace(objective, nuisance=nuisance, ceiling_db=None), known_db)
 
 
 def has_obstruction(links: Measurements) -> bool:
-    """Whether the links have the columns computed from a scene, and the direct line of at least one link is blocked."""
+    """Whether the links have the columns computed from a scene and the direct line of at least one link is blocked."""
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
 def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
     """The log-distance model with a loss out of sight and a loss per wall, using the columns computed from the scene.
 
-    The loss out of sight has a prior around a mean. The mean is part of the known path loss, and the deviation from it
-    is a coefficient. The arguments are those of `log_distance`.
+    The loss out of sight has a prior with a nonzero mean. The mean is part of the known path loss, and the deviation
+    from this mean is a coefficient. The arguments are those of `log_distance`.
 
     Raises:
         EngineError: Fewer than two links have a nonzero weight.
@@ -146,42 +146,42 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
         known_db = known_db + OUT_OF_SIGHT_DB[0] * links.table.numbers(OUT_OF_SIGHT)
     nuisance = Nuisance(len(links), tuple(terms))
     model = replace(model, nuisance=nuisance)
-    # The errors set the weight of the priors, and the priors change the errors: iterate both.
+    # The errors set the weight of the priors, and the priors change the errors, so both are iterated.
     for _ in range(ROUNDS):
         model = replace(model, noise_db=max(float(model.rmse(known_db[None])[0]), LEAST_NOISE_DB))
     return Baseline(model, known_db)
 
 
 def _free_name(by: str, terms: Sequence[Term]) -> str:
-    """A name that no other term has, for a term of the column `by`."""
+    """A name, unused by other terms, for a term of the column `by`."""
     names = {term.name for term in terms}
     plain = by.replace("_", " ") if by in (OUT_OF_SIGHT, WALLS) else by
     return next(name for name in (plain, f"{plain} of all", f"{plain} of all links") if name not in names)
 
 
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss of a model at all links [links], [dB], plus its residuals kriged from the links with nonzero weight.
+    """Path loss of a model on all links [links], [dB], plus residuals kriged from the links with nonzero weight.
 
     The model was fitted to these links; its path loss is `trend_db` [links], [dB].
 
     Raises:
-        InputError: There are too few links, or more than `MOST_KRIGED`, or all have the same position.
+        InputError: There are too few links or more than `MOST_KRIGED` links, or all links have the same position.
         EngineError: All residuals are zero.
     """
     counted = objective.weight > 0
     count = int(counted.sum())
     if count > MOST_KRIGED:
-        raise InputError(f"kriging: {count} links, at most {MOST_KRIGED}")
+        raise InputError(f"kriging: too many links ({count}), must be at most {MOST_KRIGED}")
     position = np.hstack([links.rx, links.tx])
     measured, residual = position[counted], (objective.measured - trend_db)[counted]
-    # The fit removed an intercept and, unless all distances are equal up to rounding, a slope.
+    # The fit removed an intercept and, unless all distances are equal within rounding, a slope.
     decades = np.log10(links.distance[counted])
     decades -= decades.mean()
     design = np.ones((count, 1))
     if not np.allclose(decades, 0.0, atol=ROUNDING):
         design = np.column_stack([design, decades / np.abs(decades).max()])
     field = fit_correlation(residual, measured, design=design)
-    # Simple kriging: far from all links, the expected residual is 0.
+    # This is simple kriging: far from all links, the expected residual is 0.
     weights = np.linalg.solve(field.covariance(measured), residual)
     return trend_db + field.shared_db**2 * np.exp(-cdist(position, measured) / field.range_m) @ weights
 
@@ -189,9 +189,10 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
 def kriged(
     name: Model, links: Measurements, objective: Objective, trend_db: NDArray[np.float64]
 ) -> dict[Model, NDArray[np.float64]]:
-    """The result of `kriging` under a name; empty if kriging is impossible.
+    """The result of `kriging` under the given name; empty if kriging is impossible.
 
-    Kriging is impossible with too few or too many links, if all have one position, or if all residuals are zero.
+    Kriging is impossible if there are too few or too many links, if all links have the same position, or if all
+    residuals are zero.
     """
     try:
         return {name: kriging(links, objective, trend_db)}
@@ -200,7 +201,7 @@ def kriged(
 
 
 def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.float64]]:
-    """Path loss at all links by each baseline without paths [links], [dB], fitted to the links with nonzero weight."""
+    """Path loss of each baseline without paths on all links [links], [dB], fitted to the links with nonzero weight."""
     links, known_db = setup.links, without_scene(setup.study, setup.links)
     path_loss_db = {Model.LOG_DISTANCE: log_distance(links, objective, known_db).path_loss_db()}
     if has_obstruction(links):
@@ -209,23 +210,23 @@ def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.
 
 
 PRIOR_SPREAD: Final = 0.3
-"""Standard deviation of a parameter's logarithm around its initial value, in the variants with a prior."""
+"""Standard deviation of the logarithm of a parameter around the initial value, in the variants with a prior."""
 
 OFFSET_PRIOR_DB: Final = 10.0
-"""Standard deviation of the zero-mean priors of two offsets: that of a transmitter, relative to the offset of all
-links, and that of links out of sight [dB]. In downtown Boulder, the latter offset is 11.7 dB."""
+"""Standard deviation [dB] of the zero-mean priors of two offsets: the offset of a transmitter relative to the offset of
+all links, and the offset of links out of sight. In downtown Boulder, the latter offset is 11.7 dB."""
 
 MOST_STARTS: Final = 4
-"""Largest number of known minima from which a search starts."""
+"""Maximum number of known minima from which searches start."""
 
 NEW_STARTS: Final = 4
-"""Largest number of additional starting points, if minima are known."""
+"""Maximum number of additional starting points if minima are known."""
 
 MOST_NEW_STARTS: Final = 128
-"""Largest number of starting points if no minimum is known."""
+"""Maximum number of starting points if no minimum is known."""
 
 TOLERANCE: Final = 1e-6
-"""Relative decrease of the mean square below which a search has converged; further iterations hardly change
+"""Relative decrease of the mean square error below which a search has converged; further iterations hardly change
 predictions."""
 
 NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
@@ -238,11 +239,11 @@ def fit_variants(
 
     Args:
         part: The problem; held-out links have weight 0.
-        known_minima: Minima of fits to more links, by variant [k, d], as starting points. Without the minima of the
-            study's own model, the whole ranges of its parameters are searched.
+        known_minima: Minima of fits to more links, by variant [k, d], as starting points. If the minima of the study's
+            own model are missing, the full ranges of the parameters are searched.
 
     Returns:
-        Problem and minima of each variant by name; the best minimum comes first [k, d].
+        Problem and minima [k, d] of each variant by name; the best minimum comes first.
     """
     if Model.CALIBRATED in known_minima:
         calibrated = find_minima(part, known_minima[Model.CALIBRATED], _new_starts(part))
@@ -292,7 +293,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
 def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
     """Find minima of a problem [m, d], best first, by local searches from given and new starting points [k, d]."""
-    # If minima are known, the other searches only have to show whether they lead to a lower minimum.
+    # If minima are known, the other searches only need to show whether there is a lower minimum.
     catch_up = NEARER if len(starts) else CATCH_UP
     return least_squares(
         problem, new_starts, starts[:MOST_STARTS], tolerance=TOLERANCE, catch_up=catch_up
@@ -300,7 +301,7 @@ def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) 
 
 
 def averages(path_loss_db: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """Path loss of every average for which both models are given, by name [links], [dB]."""
+    """Path loss [links], [dB], of every average for which both models are given, by name."""
     return {
         name: average.of(path_loss_db[average.first], path_loss_db[average.second])
         for name, average in AVERAGES.items()
@@ -317,20 +318,20 @@ def _searches(problem: Problem) -> int:
 def _new_starts(problem: Problem) -> int:
     """Number of additional starting points if minima of the same variant, fitted to more links, are known.
 
-    A large program gets fewer points, because its calibration makes fewer searches. With one point instead of four,
-    errors on held-out links in Auckland agree within 0.001 dB. On small programs, more points often lead to a lower
-    minimum.
+    A large path program gets fewer points, because its calibration also makes fewer searches. With one point instead of
+    four, errors on held-out links in Auckland agree within 0.001 dB. For small path programs, more points often lead to
+    a lower minimum.
     """
     return min(max(_searches(problem) // STARTS[0], 1), NEW_STARTS)
 
 
 def initial_objective(objective: Objective, setup: Setup) -> Objective:
-    """The objective for the initial materials: with a common offset of all links, unless the study declares one."""
+    """The objective for the initial materials, with an offset common to all links unless the study has an offset."""
     return _with_term(objective, CONSTANT, setup.links)
 
 
 def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
-    """The objective with offsets per transmitter and out of sight, both with a prior; None if neither is possible.
+    """The objective with offsets per transmitter and for links out of sight, both with a prior; None if impossible.
 
     There are no offsets per transmitter if there is only one transmitter, or if another term already has groups.
     """
@@ -347,7 +348,7 @@ def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
 def _with_term(
     objective: Objective, by: str, links: Measurements, prior_db: float | None = None
 ) -> Objective:
-    """The objective with one coefficient for all links of the column `by`, unless a term already has this column."""
+    """The objective with one coefficient of the column `by` for all links, unless a term already has this column."""
     if any(term.by == by for term in objective.nuisance.terms):
         return objective
     term = make_term(links, f"{by}{OF_ALL_LINKS}", by, prior=prior_db)

@@ -1,4 +1,4 @@
-"""Refit several models without each block of links in turn, and compare them on the held-out block."""
+"""Refits several models without each block of links in turn, and compares the models on the held-out block."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from calibray.validation.validation import Validation
 _LOG: Final = logging.getLogger(__name__)
 
 TX: Final = "tx"
-"""Name that selects the transmitter's position, unless the table has a column of this name."""
+"""Name that stands for the position of the transmitter, unless the table has a column of this name."""
 
 
 def validate(
@@ -55,28 +55,30 @@ def validate(
     tracer: TracerFactory = SIONNA,
     ledger: str | Path | None = None,
 ) -> Validation:
-    """Compare models on held-out links: each block of links is left out in turn and predicted.
+    """Compare models on held-out links. Each block of links is held out in turn and predicted.
 
     Args:
         study: The study, with the engine "replay"; it may already be open.
-        blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's number, or 4 if
-            the study states none.
-        by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
-        workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
-        progress: Called with the name of each stage, the work done and the total.
+        blocks: Number of spatial blocks, each held out in turn. If `blocks` and `by` are None, the number in the study
+            applies, or 4 if the study states none.
+        by: Column of labels; all links with the same label are held out together. "tx" stands for the position of the
+            transmitter.
+        workers: Workers that trace and replay chunks of links (`engines.open_workers`). If None, this process does
+            both.
+        progress: Called with the name of the stage, the completed work and the total work.
         tracer: Function that opens the scene in a ray tracer; not used for a study that is already open.
-        ledger: SQLite file that stores RT calls, such as `ledger.sqlite` in the folder of a run, for a program that
-            answers with rays; calls in it are not repeated.
+        ledger: SQLite file that stores RT calls for a program that returns rays, such as `ledger.sqlite` in the folder
+            of a run. Stored calls are not repeated.
 
     Returns:
         Held-out errors of every model, with a table and a conclusion.
 
     Raises:
-        InputError: The study has a different engine, or its links cannot be divided into these blocks.
+        InputError: The engine of the study is not "replay", or the links cannot be divided into these blocks.
         EngineError: The engine failed.
     """
     if by is not None and isinstance(study, Study):
-        # Rows that measure the same link but have different labels stay separate links.
+        # Rows of the same link with different labels remain separate links.
         study = Study.from_content(study.content() | {"holdout": {"by": by}}, study.path)
     setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
     if blocks is not None and by is not None:
@@ -86,7 +88,7 @@ def validate(
             f"validate: blocks = {blocks!r}; must be a whole number from 2 to {MOST_BLOCKS}, because each block "
             "requires a calibration"
         )
-    # Links that the study holds out are held out in turn like all others.
+    # Links that the study holds out are held out in turn like all other links.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
     engine = engines.make(setup, None, progress, ledger, workers)
@@ -99,14 +101,14 @@ def validate(
 
 
 def check_engine(study: StudyModel) -> None:
-    """Refuse an engine with which a dozen calibrations would be too expensive.
+    """Raise an error if a dozen calibrations with this engine would be too expensive.
 
     Raises:
         InputError: The engine is not "replay".
     """
     if not study.allows_blocks:
         raise InputError(
-            f"{study.path}: each held-out block requires a calibration, which is too expensive on the engine "
+            f"{study.path}: each held-out block requires a calibration, which is too expensive with the engine "
             f"{study.engine.name!r}; set engine.name to 'replay', or hold out links with holdout.where"
         )
 
@@ -121,8 +123,8 @@ def validate_problem(
     """Compare models on all links of a problem, with each block held out in turn.
 
     There are `blocks` spatial blocks, or one block for each label of the column `by`; if both are None, the study's
-    blocks are used. `known_minima` contains minima of fits to all links, by model [k, d]. If the minima of the study's
-    own model are missing, they are searched for. The stage of `progress` is "validating".
+    blocks are used. `known_minima` contains minima of fits to all links, by model [k, d]; missing minima of the study's
+    own model are searched for. `progress` reports the stage "validating".
 
     Raises:
         InputError: The links cannot be divided into these blocks.
@@ -159,7 +161,7 @@ def validate_problem(
 
 
 def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
-    """Warn of offsets that are unknown for held-out links because all links of their group are in one block [n]."""
+    """Warn of offsets that are unknown for held-out links because all links of a group are in one block [n]."""
     counted = np.flatnonzero(block >= 0)
     stated = problem.setup.study.nuisance_terms
     for term in problem.objective.nuisance.terms:
@@ -170,14 +172,14 @@ def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
         alone = np.isin(term.group[counted], groups[number == 1]).sum()
         if alone:
             _LOG.warning(
-                "%s: %s of %s links are held out together with all links of their group; their offset is then the mean "
+                "%s: %s of %s links are held out together with all links of their group. Their offset is then the mean "
                 "of the other groups, so held-out errors contain the spread between groups",
                 term.around or term.name, f"{alone:,}", f"{len(counted):,}",
             )  # fmt: skip
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Block of every link, -1 for a link of weight 0, and the labels of the blocks."""
+    """Block of every link (-1 for links of weight 0), and the labels of the blocks."""
     links, holdout = problem.setup.links, problem.setup.study.holdout
     if count is None and by is None and holdout is not None:
         count, by = holdout.blocks, holdout.by
@@ -194,7 +196,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
             link_labels = links.table.labels(by)
         names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
         labels = tuple(map(str, names))
-    # Number of links that are left when the largest block is held out, and number of unknowns fitted to them.
+    # `fewest` links remain when the largest block is held out; the unknowns are fitted to these links.
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
     unknowns = counted.sum() - problem.freedom
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:
@@ -208,14 +210,13 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Path loss at all links by model [links], [dB]; the models are fitted to the links with nonzero weight.
+    """Path loss on all links by model [links], [dB]. The models are fitted to the links with nonzero weight.
 
-    Kriging is left out if it is impossible. `fits` contains the fitted variants that use the scene, from
-    `fit_variants`.
+    Kriging is omitted if it is impossible. `fits` contains the fitted variants that use the scene (see `fit_variants`).
     """
     setup, objective = part.setup, part.objective
-    # If paths are traced around calibrated positions, replay only interpolates path loss at the stated positions;
-    # `before` is exact.
+    # If paths are traced around calibrated positions, replay only interpolates path loss at the stated positions,
+    # whereas `before` is exact there.
     path_loss_db: dict[str, NDArray[np.float64]] = {
         name: variant.objective.with_nuisance(
             part.before if name == Model.INITIAL else variant.modelled(minima[:1])[0]

@@ -1,11 +1,12 @@
-"""Validation: accuracy of several models on blocks of links, each held out in turn, and the choice between them.
+"""Validation: the accuracy of several models on blocks of links held out in turn, and the choice of a model.
 
 Predictions use the initial materials with fitted offsets unless another model is better by more than both the bootstrap
 error of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and
 5 % of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few
-blocks hardly distinguish models of similar accuracy, and a fitted model has larger errors if its fit does not apply
-elsewhere. The calibrated model without a prior must therefore be significantly better than the model with a prior. The
-chosen model is averaged with a second model, because the best model on a few blocks is often not the best elsewhere.
+blocks hardly distinguish models of similar accuracy, and a fitted model has larger errors elsewhere if its fit is
+specific to these blocks. The calibrated model without a prior must therefore be significantly better than the model
+with a prior. The chosen model is averaged with a second model, because the best model on a few blocks is often not the
+best elsewhere.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from calibray.validation.held_out_statistics import (
 
 
 def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
-    """Held-out errors of further observables, each in its unit; without rows if there are none."""
+    """Held-out errors of further observables, each in its own unit; no rows if there are no observables."""
     columns = (
         Column(), numbers("links"), numbers("RMSE"), numbers("RMSE of the mean"), numbers("RMSE of a law of distance"),
     )  # fmt: skip
@@ -62,12 +63,12 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
 class Validation(HeldOutErrors):
     """Held-out errors of several models on the same links, and the conclusions from these errors.
 
-    The error expected in a block is estimated from the other blocks, so no block contributes to its own estimate.
+    The error expected in a block is estimated from the other blocks only.
     """
 
     @classmethod
     def of(cls, errors: HeldOutErrors) -> Validation:
-        """The validation of held-out errors."""
+        """The validation that belongs to held-out errors."""
         if isinstance(errors, Validation):
             return errors
         return cls(
@@ -83,7 +84,7 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def judged(self) -> NDArray[np.bool_]:
-        """Mask of the links that are judged [links]."""
+        """Mask [links] of the links on which the models are judged."""
         return self.block >= 0
 
     @cached_property
@@ -102,17 +103,17 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def chosen(self) -> str:
-        """The prediction model; never kriging or the residual field, which help only near measured links."""
+        """The prediction model; never kriging or the residual field, because these help only near measured links."""
         return predicting(self._on(self.judged), self.position[self.judged])
 
     @cached_property
     def preferred(self) -> str:
-        """The model chosen by held-out residuals; predictions average it with a second model (`chosen`)."""
+        """The model chosen by held-out residuals. Predictions average this model with a second model (see `chosen`)."""
         return choose(self._on(self.judged), self.position[self.judged])
 
     @cached_property
     def nested_rmse_db(self) -> float:
-        """RMSE if each block is predicted by the model that is chosen on the other blocks [dB]."""
+        """RMSE [dB] if each block is predicted by the model chosen on the other blocks."""
         errors = np.full(len(self.block), np.nan)
         for block in self._blocks():
             others = self.judged & ~block
@@ -132,17 +133,17 @@ class Validation(HeldOutErrors):
 
     @property
     def choice(self) -> str:
-        """A sentence that names the model chosen for predictions, with the reason."""
+        """A sentence that names the model chosen for predictions and states the reason."""
         best = least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         partner = next((name for name in AVERAGES.get(self.chosen, ())[:2] if name != self.preferred), None)
         return choice_text(self.preferred, best, partner)
 
     def scale(self, name: str) -> float:
-        """Standard deviation expected for a model's residuals on new links [dB]: the RMS of its held-out residuals."""
+        """Expected standard deviation [dB] of a model's residuals on new links: the RMS of its held-out residuals."""
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Standard deviations of a model's held-out residuals within and between blocks; None for too few of them."""
+        """Standard deviations of a model's held-out residuals within and between blocks; None if there are too few."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
@@ -151,7 +152,7 @@ class Validation(HeldOutErrors):
         return np.sort(np.abs(self.errors[name][self.judged]))
 
     def summary(self) -> tuple[Table | str, ...]:
-        """Tables of the models and of further observables, the judgement, and the choice of the prediction model."""
+        """Tables of the models and of further observables, the comparison with the best baseline, and the choice."""
         columns = (
             Column(), numbers("RMSE", "dB"), numbers("standard deviation", "dB"), numbers("log density"),
             numbers(f"in {percent(self.level)} interval"),
@@ -196,7 +197,7 @@ class Validation(HeldOutErrors):
     def _figures(self, name: str) -> dict[str, float]:
         errors, log_density, inside = self.errors[name], [], []
         for block in self._blocks():
-            # The other blocks give the error that is expected in this block.
+            # The error expected in this block follows from the other blocks.
             others = errors[self.judged & ~block]
             rms = float(np.sqrt(np.mean(others**2)))
             log_density.append(-0.5 * (errors[block] / rms) ** 2 - np.log(rms * np.sqrt(2 * np.pi)))
