@@ -241,7 +241,7 @@ def edited(folder, **changes):
             "verdict = 'x'",
         ),
         ({"version": 2}, "has version 2, must be 1"),
-        ({"study__version": 7}, "reads version 1"),
+        ({"study__version": 7}, "study files of version 1"),
     ],
 )
 def test_a_damaged_result_is_refused(folder, changes, message):

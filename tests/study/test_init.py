@@ -139,7 +139,9 @@ def test_receivers_with_numbers_are_devices_and_the_directions_of_their_antennas
     found = draft(scene, file, tmp_path / "study.toml", frequency=60e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.offset.per == ("rx_id",)
     reasons = {each.what: each.reason for each in found.assumptions}
-    assert reasons["links.noise_floor_dbm"].endswith("no value of rx_id 1, the least sensitive device, is lower")
+    assert reasons["links.noise_floor_dbm"].endswith(
+        "no value of rx_id 1, the least sensitive device, is lower"
+    )
     assert reasons["links.rx_antenna.azimuth_deg"].startswith("column rx_azimuth_deg may describe")
 
 
@@ -169,7 +171,9 @@ def test_values_at_the_ends_of_what_a_receiver_states_are_no_measurements(tmp_pa
     assert sorted(losses) == sorted(-power[(power > -82.0) & (power < -68.0)])
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
     share = f"{100 * (power == -68.0).mean():.0f} %"
-    assert reasons["links.where"] == f"{share} of the values equal the highest value: the receiver is saturated"
+    assert (
+        reasons["links.where"] == f"{share} of the values equal the highest value: the receiver is saturated"
+    )
 
 
 def test_saturated_values_in_single_precision_are_no_measurements(tmp_path, scene):

@@ -1,7 +1,7 @@
 """A single parameter: name, bounds, start value in a scene, and frequency law.
 
-The constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], with f in GHz (ITU-R P.2040). An ITU-R
-material has the coefficients of Table 3. The constants of any other material do not depend on frequency, so their
+The constants of a material follow eps_r = a f^b and sigma = c f^d [S/m], with f in GHz (ITU-R P.2040). ITU-R materials
+have the coefficients in Table 3 of P.2040. The constants of any other material do not depend on frequency, so their
 exponents are 0.
 """
 
@@ -93,7 +93,7 @@ class Parameter:
             "region:trees.specific_attenuation".
         lower: Lower bound, in the unit of the field.
         upper: Upper bound, in the unit of the field.
-        start: Value before calibration, within the bounds, in the unit of the field.
+        start: Value before calibration, in the unit of the field; it must be within the bounds.
         scale: "linear", or "log" for a parameter that spans decades and has a positive lower bound.
         at_lower: Length of an interval of the search space that maps to the value `lower`. A prior then gives this
             value a non-zero probability.
@@ -327,7 +327,7 @@ def check_material(name: str, materials: Collection[str]) -> None:
 
 
 class PowerLaw(NamedTuple):
-    """Values of a power law s f^e and its derivatives [...].
+    """Values of a power law s f^e, and the derivatives of these values [...].
 
     Attributes:
         value: The value.

@@ -16,7 +16,7 @@ from calibray.parameters.space import Parameters
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Gaussian priors of the logarithms of k parameters, or of the values of the parameters in `linear`.
+    """Gaussian priors on the logarithms of k parameters, or on the values for parameters in `linear`.
 
     Attributes:
         index: Indices of the parameters that have a prior.
@@ -24,7 +24,7 @@ class LogNormal:
             parameter.
         spread: Standard deviations of the logarithms (0.3 corresponds to about 30 %), or of the values of parameters in
             `linear`.
-        linear: Indices of the parameters with a Gaussian prior of the value, which can be negative.
+        linear: Indices of the parameters with a Gaussian prior on the value, because the value can be negative.
         like: Pairs of indices: a parameter, and the parameter on which its prior is centred. In this way, members of a
             population scatter around a common value.
 
@@ -109,7 +109,7 @@ class LogNormal:
         drawn = candidates.copy()
         for row, reference in self._pairs:
             middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
-            # Inverse transform sampling between the bounds, below the mean as in `log_normalization`.
+            # This is inverse transform sampling between the bounds, below the mean as in `log_normalization`.
             side = np.where(low > 0, -1.0, 1.0)
             level = ndtr(side * low) + random.random(len(drawn)) * (ndtr(side * high) - ndtr(side * low))
             logarithm = middle + self.spread[row] * side * ndtri(np.clip(level, 1e-300, 1 - 1e-16))

@@ -300,7 +300,7 @@ class Parameters:
         rows, columns = parameters.matrix_indices(list(base))
         matrix = constants_matrix(base)
         batch = np.broadcast_to(matrix, (*values.shape[:-1], *matrix.shape)).copy()
-        # `rows` and `columns` have no entries for effects.
+        # Effects have no entries in `rows` and `columns`.
         cell = np.searchsorted(parameters.of_materials, indices[self.of_materials])
         batch[..., rows[cell], columns[cell]] = values[..., self.of_materials]
         return batch
@@ -328,7 +328,7 @@ class Parameters:
 
     def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:
         """Derivatives of parameter values with respect to the search coordinates at candidates [..., parameters]."""
-        # d exp(u) / du = exp(u), the value itself.
+        # The derivative of exp(u) is exp(u), the value itself.
         return np.where(self.logarithmic, self._components(candidates), 1.0)
 
     def to_unit(self, candidates: ArrayLike) -> NDArray[np.float64]:

@@ -131,7 +131,7 @@ def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class NuisanceTerm:
-    """A column of the links times an unknown coefficient, either common to all links or per group.
+    """A column of the links multiplied by an unknown coefficient, one for all links or one per group.
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
@@ -184,7 +184,7 @@ OF_ALL_LINKS: Final = " of all links"
 
 
 class NuisanceSection(Section):
-    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, either common or per group.
+    """``[nuisance.NAME]``: a column of the links multiplied by an unknown coefficient, one for all links or per group.
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
@@ -226,8 +226,8 @@ class NoiseSection(Section):
     """``[noise]``: the errors of the measured links.
 
     Attributes:
-        std_db: Standard deviation of the error of a link [dB], which determines the weight of the priors. If absent, it
-            is estimated.
+        std_db: Standard deviation [dB] of the error of a link; this value determines the weight of the priors. If
+            absent, it is estimated.
         kind: Distribution of the errors: "gaussian", "student-t", or "auto" for intervals that account for both.
         range_m: Correlation distance of the errors of neighbouring links [m]; 0 for no correlation, or "auto".
         heterogeneity: Between-building spread of the constants of a material; 0 for no spread, or "auto".
@@ -262,7 +262,7 @@ DEFAULT_BLOCKS: Final = 4
 """Default number of spatial blocks, each of which is held out in turn."""
 
 MOST_BLOCKS: Final = 100
-"""Largest number of spatial blocks. Each block requires a calibration."""
+"""Maximum number of spatial blocks. Each block requires a calibration."""
 
 
 class HoldoutSection(Section):
@@ -289,8 +289,8 @@ class FidelitySection(Section):
     """``[fidelity]``: repeated tracing with the calibrated materials, because the paths can depend on the materials.
 
     Attributes:
-        tolerance_db: Largest accepted change in the path loss of a link [dB].
-        rounds: Largest number of further traces. The default is 3, or 4 if positions are parameters.
+        tolerance_db: Largest accepted change [dB] in the path loss of a link.
+        rounds: Maximum number of further traces. The default is 3, or 4 if positions are parameters.
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
@@ -319,10 +319,10 @@ class MethodSection(Section):
 
 
 LARGEST: Final = 10**6
-"""Largest integer value of a setting; no method can hold more candidates in memory."""
+"""Maximum integer value of a setting; no method can hold more candidates in memory."""
 
 LONGEST: Final = 10**4
-"""Largest number of entries in a list, and of characters in a string."""
+"""Maximum number of entries in a list, and of characters in a string."""
 
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),

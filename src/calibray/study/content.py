@@ -67,8 +67,8 @@ class StudyContent(Section, ABC):
     def _known_version(cls, value: int) -> int:
         if value != VERSION:
             raise InputError(
-                f"this version of Calibray reads version {VERSION} of the study file; convert the file, or install a "
-                "version of Calibray that reads it"
+                f"this version of Calibray reads only study files of version {VERSION}; convert the file, or install a "
+                "version of Calibray that can read this file"
             )
         return value
 
@@ -109,7 +109,7 @@ class StudyContent(Section, ABC):
             self.links.mountings or self.links.position_error_m is not None
         ):
             raise InputError(
-                "engine.rays contains paths for one position and one antenna at each end: remove links.tx_antenna, "
+                "the paths in engine.rays apply to one position and one antenna at each end: remove links.tx_antenna, "
                 "links.rx_antenna and links.position_error_m"
             )
         if self.links.mountings and self.engine.name != "replay":
@@ -225,7 +225,7 @@ class StudyContent(Section, ABC):
             )
         if links.std is None and self.noise.std_db is None:
             raise InputError(
-                "links.position_error_m adds to the other errors of a link: give links.std or noise.std_db [dB]"
+                "links.position_error_m also needs the other errors of a link: give links.std or noise.std_db [dB]"
             )
 
     def _check_poses(self) -> None:
@@ -271,7 +271,7 @@ class StudyContent(Section, ABC):
                     raise InputError(f"{dotted(('materials', name))}: {error}") from None
 
     def _check_parameters(self) -> None:
-        """Check the parameters as far as possible without the scene; `parameter_set` checks the rest."""
+        """Check the parameters as far as possible without the scene; `parameter_set` makes the remaining checks."""
         frequency, parameters = self.scene.frequency, []
         for name, entry in self.parameters.items():
             start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
@@ -304,7 +304,7 @@ class StudyContent(Section, ABC):
             raise InputError(f"{name}: prior.like = {like!r}: must be a parameter of the same constant")
         if other.prior is not None and other.prior.like is not None:
             raise InputError(
-                f"{name}: prior.like = {like!r}: is itself centred on another parameter; name that parameter"
+                f"{name}: prior.like = {like!r}: is itself centred on another parameter; give the latter"
             )
         if not other.bounds[0] > 0:
             raise InputError(

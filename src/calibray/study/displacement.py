@@ -56,7 +56,7 @@ class Displacement:
 
     Attributes:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
-        weights: 1 if a parameter displaces a group of links, otherwise 0 [G, parameters].
+        weights: 1 if a parameter displaces a group of links, and 0 otherwise [G, parameters].
         group: Group of every link [L].
         reach: Largest displacement that a single parameter can cause in each group [G], [m]. The sum over parameters
             has the same limit.
@@ -175,7 +175,7 @@ def displacement_loss(
     here: tuple[Paths, Effects],
     traced: Callable[[Measurements], tuple[Paths, Effects]],
 ) -> DisplacementLoss:
-    """The change in path loss due to displacements, from one trace of the links at all neighbouring positions.
+    """The change in path loss due to displacements, from a single trace of all links at all neighbouring positions.
 
     Args:
         displacements: The K displacements.

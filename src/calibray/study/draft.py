@@ -1,6 +1,7 @@
 """Drafts a study from a scene and a table of links. The draft is TOML; comments state the reason for each assumption.
 
-Names of columns, groups and files are user input. `study_text` quotes them, so none is interpreted as TOML.
+Names of columns, groups and files are user input. `study_text` quotes this input, so TOML never interprets a name as
+syntax.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ CLIPPED_RATIO: Final = 10
 """Minimum ratio of the count of the lowest value to the median count of other values at which clipping is assumed."""
 
 MISSING_SHARE: Final = 0.1
-"""Share of missing powers of a device above which the lowest power of the device is used as its noise floor."""
+"""Fraction of missing powers of a device above which the lowest power of this device is used as its noise floor."""
 
 FEWEST_OF_DEVICE: Final = 20
 """Minimum number of measured powers from which the noise floor of a device is inferred. The lowest of 20 powers is in
@@ -134,7 +135,7 @@ def _offset_groups(draft: LinksDraft, value: ValueColumn) -> list[str]:
 
 
 def _carriers_of_transmitters(draft: LinksDraft) -> list[str]:
-    """The column of carriers, if a transmitter has several carriers."""
+    """The column of carriers, if any transmitter has several carriers."""
     frame, name, carrier = draft.table.frame, draft.section.get("transmitter"), draft.section.get("frequency")
     if (
         carrier is None
@@ -372,11 +373,11 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
     try:
         return read_scene(links.scene, links.frequency), {}
     except InputError:
-        # From 1 to 10 GHz, Table 3 covers every material that occurs in scenes.
+        # From 1 to 10 GHz, Table 3 of ITU-R P.2040 covers every material that occurs in scenes.
         covered = read_scene(links.scene, float(np.clip(links.frequency, 1e9, 10e9)))
     constants = {}
     for name, law in covered.laws.items():
-        # Laws of P.2040: a f^b and c f^d, with f in GHz.
+        # The laws of ITU-R P.2040 are a f^b and c f^d, with f in GHz.
         nearest = float(np.clip(links.frequency / 1e9, law.lower, law.upper))
         if nearest != links.frequency / 1e9:
             permittivity, conductivity = law.a * nearest**law.b, law.c * nearest**law.d
@@ -476,7 +477,8 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
         links.assume(f"links.tx_antenna.{key}", column, reason)
     if "azimuth_deg" not in mount and folder is not None and not omnidirectional.all():
         _LOG.warning(
-            "%s: no azimuths, so directional antennas point east; add a column 'azimuth' [deg], clockwise from north",
+            "%s: there are no azimuths, so directional antennas point east; add a column 'azimuth' [deg], clockwise "
+            "from north",
             links.transmitter_table.source,
         )
     if folder is None and "azimuth_deg" in mount:

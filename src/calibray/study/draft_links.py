@@ -145,7 +145,7 @@ class LinksDraft:
 
     @property
     def scene_section(self) -> dict[str, Any]:
-        """The keys of ``[scene]`` other than the carrier; the file is relative to the study file's folder."""
+        """The keys of ``[scene]`` other than the carrier. The file name is relative to the folder of the study file."""
         file = self.scene if self.scene.startswith(BUNDLED) else self.relative(Path(self.scene))
         return {"file": file} | ({} if self.given.origin is None else {"origin": list(self.given.origin)})
 
@@ -218,7 +218,7 @@ class LinksDraft:
         if key is not None:
             name, of_table = key
             reason = f"the values also occur in column {of_table} of {self.given.transmitters.name}"
-            reason = reason if shared is None else "both tables contain this column and share values in it"
+            reason = reason if shared is None else "this column occurs in both tables, with common values"
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, reason)
             self._leave_out_unknown_transmitters(name, self.sites.frame[of_table])
@@ -334,7 +334,7 @@ class LinksDraft:
         return [(self.links, self.table.frame), *([(sites, self.transmitter_rows)] if sites else [])]
 
     def _stated_frequency(self) -> tuple[float, str] | None:
-        """A carrier stated in a table [Hz] and its source; a column of several carriers becomes `links.frequency`."""
+        """A carrier [Hz] stated in a table, and its source. A column of several carriers becomes `links.frequency`."""
         tables = ((*table, column_names.find_frequency(table[1])) for table in self._frequency_tables())
         stated = next(((file, rows, column) for file, rows, column in tables if column is not None), None)
         if stated is None:
@@ -478,7 +478,7 @@ class LinksDraft:
             )
         if rx.position == "geographic":
             raise InputError(
-                f"{self.links}: heights are not in metres ({', '.join(names)}); give heights in metres"
+                f"{self.links}: the heights ({', '.join(names)}) are not in metres; give heights in metres"
             )
         self.section["position_unit"] = unit
         self.assume("links.position_unit", f"{unit:g} m", f"stated in the column names {', '.join(names)}")

@@ -54,8 +54,8 @@ class FacadeSection(Section):
             polygons are used.
         position: "geographic" or "scene", as in ``[regions]``.
         share: Fraction of the wall that strips of this material, such as windows, cover.
-        module: Distance between the centres of neighbouring strips [m], rounded so that a wall has a whole number of
-            strips.
+        module: Distance [m] between the centres of neighbouring strips; it is rounded so that a wall has a whole number
+            of strips.
     """
 
     of: Text
@@ -230,7 +230,7 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
     outward = normal[nearest] / np.linalg.norm(normal[nearest], axis=1, keepdims=True)
     front, back = (surfaces.under_roof(point + side * BESIDE * outward) for side in (1, -1))
     outward = np.where((front & ~back)[:, None], -outward, outward)
-    # The arctangent of east over north is measured clockwise from north.
+    # The arctangent of east over north is an angle clockwise from north.
     bearing = np.degrees(np.arctan2(outward[:, 0], outward[:, 1])) % 360
     return bearing, along, length, distance
 

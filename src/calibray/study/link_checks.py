@@ -53,8 +53,8 @@ three of about 47 positions had 60 rows each (an effective fraction of 10 %). Pr
 the errors nor the coverage changed."""
 
 SPREAD: Final = 5.0
-"""Width [m] of the cells in which GPS positions, such as those of a parked car, count as one. Phones are accurate to
-4.9 m under an open sky (GPS.gov, GPS accuracy)."""
+"""Width [m] of the cells in which GPS positions, such as those of a parked car, count as one. GPS positions of phones
+are accurate to 4.9 m under an open sky (GPS.gov, GPS accuracy)."""
 
 LOSSY: Final = 0.5
 """Mean gain [1] below which a gain table with a maximum of exactly 0 dBi probably contains relative gains."""
@@ -140,7 +140,7 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
 
 
 def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Measurements) -> int:
-    """Number of coefficients of a nuisance term, one per group.
+    """Number of coefficients of a nuisance term, which is the number of groups.
 
     A random effect counts as one coefficient, because only its mean is free.
     """
@@ -178,7 +178,7 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
     cell = SPREAD if is_geographic else 0.01
     ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
-    # The number of positions if all have equally many rows, and nearly 1 if one position has nearly all rows.
+    # `effective` is the number of positions if all have equally many rows; it is nearly 1 if one has nearly all rows.
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
         within = f" within {cell:g} m" if is_geographic else ""
@@ -261,7 +261,7 @@ def _positions(study: StudyModel, overhead: SceneSurfaces, links: Measurements) 
         yield (
             f"{int(beyond.sum())} of {len(rx)} receivers are outside the scene, where there is no ground and no "
             f"building (links there: {len(rows):,}, the first in row {rows[0]})",
-            "leave out wrong positions with links.where, or create a larger scene",
+            "use links.where to leave out wrong positions, or create a larger scene",
         )
     if through_walls:
         return  # antennas may be indoors
@@ -405,8 +405,8 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
         yield (
             f"{int(below.sum())} of {len(links)} path losses are below free-space loss, with a median difference of "
             f"{median:.0f} dB",
-            "check tx_power_dbm (30 dB: watts instead of milliwatts), gains included in the values, scene.frequency "
-            "and the sign",
+            "check tx_power_dbm (30 dB indicates watts instead of milliwatts), gains included in the values, "
+            "scene.frequency and the sign",
         )
 
 

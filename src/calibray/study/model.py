@@ -38,7 +38,7 @@ _NEEDED: Final = {
     "regions": {"position": "file"},
     "facades": {"position": "file", "module": "share", "storey_height": "storeys"},
 }
-"""Keys that have no effect without another key of the same table, by section."""
+"""Keys that have no effect without another key in the same table, by section."""
 
 
 class StudyModel(StudyContent, ABC):
@@ -57,7 +57,7 @@ class StudyModel(StudyContent, ABC):
         study = cls.from_content(content, path)
         study.check_files()
         for key, needed in _keys_without_effect(content):
-            _LOG.warning("%s: %s has no effect without %s; remove it", path, key, needed)
+            _LOG.warning("%s: %s has no effect without %s; remove this key", path, key, needed)
         if len(others := study._other_engines) == 1 and is_shared(key := next(iter(others))):
             _LOG.warning(
                 "%s: engine.%s = %r has no effect with engine.name = %r; correct or remove it",

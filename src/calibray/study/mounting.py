@@ -55,8 +55,8 @@ def check_mounting_columns(study: StudyModel, table: SourceTable) -> None:
             if end == "tx" and study.transmitters_path is not None and not table.joined:
                 own = [name for name in (study.links.transmitter, *study.links.rx) if isinstance(name, str)]
                 remedy = (
-                    f"add it to the columns {shortened(', '.join(map(str, table.frame)), 200)}, or leave out tx_x, "
-                    f"tx_y and tx_z and give {', '.join(own)} as in the study's table, so that the antennas come from "
+                    f"add this column to {shortened(', '.join(map(str, table.frame)), 200)}, or leave out tx_x, "
+                    f"tx_y and tx_z and give {', '.join(own)} as in the study's table, which takes the antennas from "
                     f"{study.transmitters_path}"
                 )
             raise InputError(
@@ -88,7 +88,7 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
         yaw = np.arctan2(away[:, 1], away[:, 0])
         # Downtilt is positive downwards.
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
-    # A bearing is clockwise from north and yaw counter-clockwise from east; steering has the sense of the azimuth.
+    # A bearing is clockwise from north, yaw counter-clockwise from east. Steering has the same sense as azimuth.
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     if section.azimuth_from == "north":

@@ -183,7 +183,7 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
 
 
 def filtered_values(section: ObservableSection, table: SourceTable) -> NDArray[np.float64] | None:
-    """Values of an observable [rows] in the study's unit, NaN for rows that its filter excludes.
+    """Values of an observable [rows] in the unit of the study; NaN for rows that the filter of the observable excludes.
 
     The result is None if the filter cannot be applied to the rows, for example because one of its columns is added
     later.

@@ -57,7 +57,7 @@ class MaterialSection(Section):
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
-        scattering_coefficient: Scattering coefficient [1]. A value of 0 stated here is exact, unlike a value of 0 in
+        scattering_coefficient: Scattering coefficient [1]. A value of 0 in the study is exact, unlike a value of 0 in
             the scene.
         xpd_coefficient: Cross-polarization discrimination coefficient [1].
         scattering_pattern: "lambertian", "directive" or "backscattering".
@@ -112,16 +112,20 @@ class AverageSection(Section):
     @model_validator(mode="after")
     def _sized_or_timed(self) -> Self:
         if (self.by == "place") != (self.size is None):
-            remedy = "has no size; remove the key" if self.by == "place" else "needs size, in m or s"
+            remedy = "does not use size; remove the key" if self.by == "place" else "needs size, in m or s"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         if (self.by == "time") != (self.time is not None):
-            remedy = "needs time, the column of times" if self.by == "time" else "has no time; remove the key"
+            remedy = (
+                "needs time, the column of times"
+                if self.by == "time"
+                else "does not use time; remove the key"
+            )
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         return self
 
 
 def _section_of_place(value: Any) -> Any:
-    """``average = "place"`` is short for ``average = { by = "place" }``."""
+    """Expand ``average = "place"``, which is short for ``average = { by = "place" }``."""
     return {"by": "place"} if value == "place" else value
 
 
@@ -138,7 +142,7 @@ class TrackSection(Section):
         file: GPX file, relative to the study file's folder.
         time: Column with the times of the rows, in ISO 8601 or as seconds since 1970.
         longest_gap: Longest permitted time [s] between two track points; rows in longer gaps are excluded.
-        clock: Time by which the clock of the table is ahead of the clock of the track [s].
+        clock: Time [s] by which the clock of the table is ahead of the clock of the track.
     """
 
     file: Text

@@ -350,7 +350,7 @@ class Setup:
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
             return self._mounted(self._trace_links(self._links_in_place, scene, progress), scene)
-        # Paths do not depend on the carrier, so a pair of ends that occurs at several carriers is traced once.
+        # Paths do not depend on the carrier, so a pair of positions that occurs at several carriers is traced once.
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)

@@ -130,7 +130,7 @@ class Study(StudyModel):
         return study_links(self)
 
     def places(self, table: SourceTable) -> Measurements:
-        """Links without measured values, for prediction, with the groups of the offset.
+        """Links without measured values, for predictions, with the groups of the offset.
 
         Args:
             table: Rows in the format of the study's table, or with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m]
@@ -237,8 +237,8 @@ AIR: Final = 1.1
 """Largest permittivity that counts as air; all other ITU-R P.2040 materials have at least 1.26 (ceiling board)."""
 
 LARGEST_PERMITTIVITY: Final = 15.0
-"""Default upper bound of a calibrated permittivity, more than twice the largest permittivity of a building material in
-ITU-R P.2040."""
+"""Default upper bound of a calibrated permittivity. The value is more than twice the largest permittivity of a building
+material in ITU-R P.2040."""
 
 
 METAL: Final = 1e6
@@ -249,7 +249,8 @@ power at any permittivity."""
 def permittivity_bounds(materials: Mapping[str, Material]) -> dict[str, list[float]]:
     """Default permittivity bounds of all materials except air and metal, by material name.
 
-    Ceiling board has a lower permittivity than other building materials, and wet ground a much higher one.
+    Compared with other building materials, ceiling board has a lower permittivity and wet ground a much higher
+    permittivity.
     """
     return {
         name: [min(1.5, round(1 + 0.75 * (start - 1), 3)), max(LARGEST_PERMITTIVITY, round(2 * start))]
@@ -352,8 +353,8 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
                 raise InputError(f"measured: {what} {label!r} is repeated; give one {what} for each {kind}")
             if unknown := [str(label) for label in labels if label not in names]:
                 raise InputError(
-                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows are transmitters, and columns "
-                    "are receivers"
+                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows must be transmitters, and "
+                    "columns are receivers"
                 )
         measured = measured.reindex(index=list(live.tx), columns=list(live.rx)).to_numpy()
     elif isinstance(measured, str | Path):

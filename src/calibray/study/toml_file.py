@@ -41,7 +41,7 @@ def read_content(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8 text; save the file as UTF-8") from None
+        raise InputError(f"{path}: is not UTF-8 text; save the file as UTF-8") from None
     except (ValueError, RecursionError) as error:
         # The cause can also be a number with thousands of digits, or lists nested thousands of levels deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
@@ -157,7 +157,7 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
 
     expanded, count = re.subn(r"\$\{([A-Za-z_]\w*)(?::-([^{}]*))?\}", value, text)
     if text.count("${") != count:
-        raise InputError("malformed ${...}; write ${NAME} or ${NAME:-DEFAULT}")
+        raise InputError("malformed environment variable ${...}; write ${NAME} or ${NAME:-DEFAULT}")
     return expanded
 
 
@@ -170,7 +170,7 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
         InputError: The value of a key of another engine is invalid, or several engines share the key and only an engine
             that the table does not describe accepts the value.
     """
-    # The study's own validation rejects a value that is not a table or does not name an engine.
+    # The validation of the study rejects a value that is not a table or does not name an engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
     if not isinstance(name, str) or name not in KINDS:
         return content, {}

@@ -138,7 +138,7 @@ def read_rays(
     axes: str = "x y z",
     tx_power_dbm: float | None = None,
 ) -> Paths:
-    """Read the paths of any engine (docs/reference/ray-table.md).
+    """Read the paths computed by any engine (see docs/reference/ray-table.md).
 
     If the table contains the powers of the paths, the path program includes a correction. With this correction, every
     path has the power stated in the table for the materials of the scene or the start values of the study.
@@ -199,11 +199,11 @@ def read_rays(
 def write_rays(paths: Paths, file: str | Path, *, overwrite: bool = False) -> None:
     """Write paths as a ray table for other engines and programs. Powers are computed with the materials of `paths`.
 
-    The file name must end in .csv, .parquet, .json or .h5. With `overwrite`, even a file that Calibray did not write is
-    replaced.
+    The file name must end in .csv, .parquet, .json or .h5. With `overwrite`, even an existing file that Calibray did
+    not write is replaced.
 
     Raises:
-        InputError: `paths` are not Paths, or the file cannot be written.
+        InputError: `paths` is not a Paths object, or the file cannot be written.
     """
     if not isinstance(paths, Paths):
         raise InputError(

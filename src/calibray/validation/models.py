@@ -162,7 +162,7 @@ def _free_name(by: str, terms: Sequence[Term]) -> str:
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:
     """Path loss of a model on all links [links], [dB], plus residuals kriged from the links with nonzero weight.
 
-    The model was fitted to these links; its path loss is `trend_db` [links], [dB].
+    The model was fitted to these links. Its path loss is `trend_db` [links], [dB].
 
     Raises:
         InputError: There are too few links or more than `MOST_KRIGED` links, or all links have the same position.
@@ -292,7 +292,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
 
 def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) -> NDArray[np.float64]:
-    """Find minima of a problem [m, d], best first, by local searches from given and new starting points [k, d]."""
+    """Find minima [m, d] of a problem, best first, by local searches from given and new starting points [k, d]."""
     # If minima are known, the other searches only need to show whether there is a lower minimum.
     catch_up = NEARER if len(starts) else CATCH_UP
     return least_squares(

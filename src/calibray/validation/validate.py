@@ -58,7 +58,7 @@ def validate(
     """Compare models on held-out links. Each block of links is held out in turn and predicted.
 
     Args:
-        study: The study, with the engine "replay"; it may already be open.
+        study: The study, which may already be open; its engine must be "replay".
         blocks: Number of spatial blocks, each held out in turn. If `blocks` and `by` are None, the number in the study
             applies, or 4 if the study states none.
         by: Column of labels; all links with the same label are held out together. "tx" stands for the position of the
@@ -66,7 +66,7 @@ def validate(
         workers: Workers that trace and replay chunks of links (`engines.open_workers`). If None, this process does
             both.
         progress: Called with the name of the stage, the completed work and the total work.
-        tracer: Function that opens the scene in a ray tracer; not used for a study that is already open.
+        tracer: Function that opens the scene in a ray tracer; ignored if the study is already open.
         ledger: SQLite file that stores RT calls for a program that returns rays, such as `ledger.sqlite` in the folder
             of a run. Stored calls are not repeated.
 
@@ -122,9 +122,9 @@ def validate_problem(
 ) -> Validation:
     """Compare models on all links of a problem, with each block held out in turn.
 
-    There are `blocks` spatial blocks, or one block for each label of the column `by`; if both are None, the study's
-    blocks are used. `known_minima` contains minima of fits to all links, by model [k, d]; missing minima of the study's
-    own model are searched for. `progress` reports the stage "validating".
+    There are `blocks` spatial blocks, or one block for each label in the column `by`. If both are None, the blocks of
+    the study are used. `known_minima` contains minima of fits to all links, by model [k, d]; missing minima of the
+    study's own model are searched for. `progress` reports the stage "validating".
 
     Raises:
         InputError: The links cannot be divided into these blocks.
@@ -202,7 +202,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:
         raise InputError(
             f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} links to calibrate "
-            f"{unknowns:.0f} unknowns; use at least two blocks with fewer links each, or remove [holdout]"
+            f"{unknowns:.0f} unknowns; use at least two blocks, with fewer links in each block, or remove [holdout]"
         )
     return block, labels
 

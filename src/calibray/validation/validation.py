@@ -128,7 +128,7 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """A sentence that states how much the calibration improves on the best baseline, and how certain this is."""
+        """A sentence on the improvement of the calibration over the best baseline, and the certainty of this gain."""
         return judgement_text(self.judgement)
 
     @property
@@ -164,7 +164,7 @@ class Validation(HeldOutErrors):
         )  # fmt: skip
         title = f"{len(self.labels)} blocks held out in turn, {np.count_nonzero(self.judged)} links"
         nested = (
-            "If each block is predicted by the model that is chosen on the other blocks, the RMSE is "
+            "If each block is predicted by the model chosen on the other blocks, the RMSE is "
             f"{self.nested_rmse_db:.2f} dB."
         )
         further = (observables_table(self.observables),) if self.observables else ()
