@@ -239,7 +239,7 @@ def test_on_an_external_program_the_spread_takes_no_further_call(tmp_path):
 
 def test_squares_of_a_side_need_clusters_and_one_side(tmp_path):
     plain = {"by": "constant", "per": "street", "cluster_m": 10.0}
-    with pytest.raises(InputError, match="cluster_m, the side length of squares, needs per = 'cluster'"):
+    with pytest.raises(InputError, match="cluster_m, the side length of the squares, needs per = 'cluster'"):
         planted.study(tmp_path, planted.campaign(), nuisance={"x": plain})
     terms = {name: plain | {"per": "cluster", "cluster_m": side} for name, side in (("x", 5.0), ("y", 6.0))}
     with pytest.raises(InputError, match="cluster_m differs between terms"):

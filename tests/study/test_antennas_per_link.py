@@ -117,8 +117,8 @@ def test_a_table_to_predict_without_the_columns_of_the_antennas_is_refused_befor
     table = pd.DataFrame([[0.0, 0.0, 10.0, 50.0, 0.0, 1.5]], columns=COLUMNS)
     with pytest.raises(
         InputError,
-        match=r"links: no column 'antenna' \(links\.tx_antenna\.type\); add it to the columns tx_x, .* rx_z, or leave "
-        r"out tx_x, tx_y and tx_z and give transmitter, rx_x, rx_y, rx_z as in the study's table, so .*sites\.csv",
+        match=r"links: no column 'antenna' \(links\.tx_antenna\.type\); add this column to tx_x, .* rx_z, or leave "
+        r"out tx_x, tx_y and tx_z and give transmitter, rx_x, rx_y, rx_z as in the study's table, which .*sites\.csv",
     ):
         as_links(result, table)
 

@@ -65,7 +65,7 @@ def test_a_phones_log_becomes_a_study_that_reads(scene, tmp_path):
     picture = tmp_path / "antennas.svg"
     status, out, err = typed(*words, "-o", file, "--plot", picture)
     assert status == 0, err
-    assert "1253 values are missing, and none is lower" in out
+    assert "1253 values are missing, and no measured value is lower" in out
     assert picture.exists()
     study = Study.load(file)
     assert study.links.quantity == "rsrp"
@@ -88,8 +88,8 @@ def test_a_phones_log_becomes_a_study_that_reads(scene, tmp_path):
 @pytest.mark.parametrize(
     ("column", "offsets", "reason"),
     [
-        ("Gerät", "Zelle, Gerät", "each transmitter and each receiver has a different gain"),
-        ("Straße", "Zelle", "no column of devices was found; each transmitter has a different gain"),
+        ("Gerät", "Zelle, Gerät", "each transmitter and each receiver has its own gain"),
+        ("Straße", "Zelle", "no column of receiving devices was found; each transmitter has its own gain"),
     ],
 )
 def test_the_reason_of_the_offsets_says_which_columns_were_found(scene, tmp_path, column, offsets, reason):
@@ -127,7 +127,8 @@ def test_the_noise_floor_is_that_of_the_least_sensitive_receiver(scene, tmp_path
     found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.links.noise_floor_dbm == np.floor(power[power > -80].min())
     assert any(
-        "none of receiver B, the least sensitive, is lower" in each.reason for each in found.assumptions
+        "no value of receiver B, the least sensitive device, is lower" in each.reason
+        for each in found.assumptions
     )
 
 
@@ -154,7 +155,7 @@ def test_the_noise_floor_is_that_of_the_least_sensitive_receiver_that_states_it(
     found = draft(scene, file, tmp_path / "study.toml", frequency=3.5e9, tx=[-30.0, 0.0, 9.0])
     assert found.study.links.noise_floor_dbm == -80.0
     assert any(
-        "of receiver B, the least sensitive, equal its lowest one" in each.reason
+        "of receiver B, the least sensitive device, equal its lowest value" in each.reason
         for each in found.assumptions
     )
     # The received powers of all receivers are above it, and none of them is a floor.
@@ -268,7 +269,7 @@ def test_a_column_of_altitudes_that_is_not_used_is_named(scene, tmp_path, column
     found = draft(scene, file, tmp_path / "study.toml", tmp_path / "masts.csv", 2.4e9)
     (reason,) = [each.reason for each in found.assumptions if each.what == "links.rx"]
     assert found.study.links.rx == ("lon", "lat", height)
-    assert ("alt is ignored, because it may be above sea level" in reason) == (column == "alt")
+    assert ("alt is ignored, because altitudes may be above sea level" in reason) == (column == "alt")
 
 
 @pytest.mark.parametrize(("places", "height"), [(12, 1.5), (2, 10.0)])
@@ -439,7 +440,7 @@ def test_codes_of_missing_values_and_unknown_transmitters_are_reported(scene, tm
     drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
     assert reasons["links.where"] == "sites.csv lacks C, D: 2 rows are left out"
-    assert reasons["links.missing"] == "far from all other values of rssi, therefore treated as missing"
+    assert reasons["links.missing"] == "far from all other values of rssi and therefore treated as missing"
     assert drafted.study.links.missing == (100.0,)
     assert drafted.study.links.noise_floor_dbm == -80.0
     links = drafted.study.measurements()
@@ -502,7 +503,7 @@ def test_faults_of_the_table_of_transmitters_are_named(scene, tmp_path):
     sites.write_text("cell,x,y,Height AMSL (m)\nA,-30,0,55\nB,60,0,55\n")
     drafted = draft(scene, file, study, sites, 3.5e9)
     reasons = {each.what: each.reason for each in drafted.assumptions}
-    assert "Height AMSL (m) is ignored, because it may be above sea level" in reasons["links.tx"]
+    assert "Height AMSL (m) is ignored, because altitudes may be above sea level" in reasons["links.tx"]
 
 
 def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(scene, tmp_path):
@@ -510,7 +511,7 @@ def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(sce
     file = table(tmp_path, x=np.arange(10.0), y=20.0, gatewayId=list("AABBAABBAC"), rssi=np.arange(-80, -70))
     drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
     reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
-    assert reasons["links.transmitter"] == "its values are in column id of gateways.csv"
+    assert reasons["links.transmitter"] == "the values also occur in column id of gateways.csv"
     assert reasons["links.where"] == "gateways.csv lacks C: 1 row is left out"
     assert drafted.study.offset.per == ("gatewayId",)
     links = drafted.study.measurements()

@@ -246,7 +246,7 @@ def test_a_polygon_without_ground_below_it_is_refused_by_its_number():
 def test_a_region_outside_the_scene_is_named_in_a_warning(tmp_path, caplog):
     away = REGIONS["trees"] | {"boxes": [[5000, 5000, 5010, 5010]], "heights": "ground"}
     assert not len(study_regions(study(tmp_path, regions={"trees": away}))["trees"].outline)
-    assert "study.toml: [regions.trees] is outside the scene, so it has no effect" in caplog.text
+    assert "study.toml: [regions.trees] is outside the scene and has no effect" in caplog.text
     caplog.clear()
     study_regions(study(tmp_path, regions={"trees": REGIONS["trees"] | {"heights": "ground"}}))
     assert not caplog.text

@@ -122,7 +122,7 @@ def test_positions_of_transmitters_come_from_their_table_in_predictions_too(fold
     log = pd.read_csv(folder / "log.csv").drop(columns="rsrp")
     links = study(folder).places(SourceTable(log.assign(height=1.5), source="new.csv"))
     assert links.tx[:, 2] == pytest.approx(study(folder).places(SourceTable(log)).tx[:, 2])
-    assert "new.csv: column height is ignored, because the calibration took it from" in caplog.text
+    assert "new.csv: column height is ignored, because the calibration took this column from" in caplog.text
     # A column that the measured links have themselves is theirs in predictions too.
     (folder / "own.csv").write_text((folder / "log.csv").read_text().replace("rsrp", "height"))
     own = study(folder, file="own.csv", value="height").places(SourceTable(log.assign(height=12.0)))

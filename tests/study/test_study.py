@@ -217,7 +217,7 @@ TRACE = "max_depth = 4"
         ("frequency = 4e9", "", "study.toml: scene.frequency: is required"),
         ("version = 1", "", "study.toml: version: is required"),
         # Values
-        ("version = 1", "version = 2", "study.toml: version = 2: this version of Calibray reads version 1"),
+        ("version = 1", "version = 2", "study.toml: version = 2: this version of Calibray reads only study files"),
         ("frequency = 4e9", "frequency = 4", "scene.frequency = 4: must be from 1e+06 to 1e+12 Hz"),
         ("frequency = 4e9", "frequency = '4e9'", "scene.frequency = '4e9': must be a number"),
         ("frequency = 4e9", "frequency = inf", "scene.frequency = inf: must be a finite number"),

@@ -272,7 +272,7 @@ class LinksDraft:
         if names:
             counts = [f"{name} ({counted(int((column == name).sum()), 'row')})" for name in names]
             _LOG.warning(
-                "%s: %s lacks %s; the rows of these transmitters are left out; to keep the rows, add the transmitters",
+                "%s: %s lacks %s; these rows are left out; to keep the rows, add these transmitters to the table",
                 self.links, source, shortened(", ".join(counts), 300),
             )  # fmt: skip
 

@@ -192,9 +192,7 @@ def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArr
     # Polygons and multipolygons.
     polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
     if not polygon.any():
-        raise InputError(
-            f"{path}: contains no polygon ({len(polygon)} other features); give a file of outlines"
-        )
+        raise InputError(f"{path}: none of the {len(polygon)} features is a polygon; give a file of outlines")
     outline = shapely.make_valid(features.outline[polygon])
     if position == "geographic":
         known = _known(frame, path)

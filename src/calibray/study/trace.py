@@ -146,7 +146,7 @@ def read_rays(
     Args:
         rays: The ray table: a .csv, .parquet, .json or .h5 file, or a DataFrame of its rows. Alternatively, the paths
             of another program: one or several .p2m files of Wireless InSite (a file, list or folder), the folder of an
-                AODT run or a DeepMIMO scenario, or the `Paths` of Sionna RT.
+            AODT run or a DeepMIMO scenario, or the `Paths` of Sionna RT.
         scene: Mitsuba XML file, `sionna:NAME`, or a `Scene`, with the constants that the engine used. Alternatively, a
             study that states carrier and links. Its start values must be those that the engine used.
         frequency: Carrier frequency [Hz]; required unless `scene` is a study.
