@@ -292,7 +292,7 @@ def test_average_by_place_takes_no_size_and_other_averages_need_one(folder):
     assert len(links) == 16  # two phones, two sites, four positions
     assert study(folder, average={"by": "place"}).links == study(folder, average="place").links
     for average, message in (
-        ({"by": "place", "size": 1.0}, "by = 'place' has no size"),
+        ({"by": "place", "size": 1.0}, "by = 'place' does not use size"),
         ({"by": "cell"}, "by = 'cell' needs size"),
         ({"by": "place", "minimum_count": 0}, "minimum_count"),
     ):

@@ -138,7 +138,7 @@ def with_facades(
 ) -> Paths:
     """The paths with the materials of facades at interactions. If several facades apply, the first is used.
 
-    `files` contains the resolved paths of the files of facades. `materials` includes those of the scene and of facades.
+    `files` contains the resolved file paths of facades. `materials` includes those of the scene and of facades.
 
     Raises:
         InputError: A file cannot be used, or there is no ground below a wall.

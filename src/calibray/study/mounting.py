@@ -263,9 +263,9 @@ def estimated_fields(study: StudyModel) -> tuple[str, ...]:
 
 
 def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
-    """The content of a study in which each parameter with a `spread` becomes one parameter per transmitter.
+    """The content of a study with one further parameter per transmitter for each parameter that has a `spread`.
 
-    A further parameter represents transmitters without measured links. Its prior is that of the population, and no link
+    Another parameter represents transmitters without measured links. Its prior is that of the population, and no link
     constrains this parameter.
 
     Raises:

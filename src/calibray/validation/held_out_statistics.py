@@ -178,8 +178,8 @@ def two_levels(
 
     Each new street has its own error, so a few blocks contain less information than the number of links suggests.
     `position` [n, k], [m], contains the positions of both ends of each link. `fitted` [m, k] contains the positions of
-    the links to which the models were fitted; if None, these are the links of the other blocks. The result is None if
-    there are fewer than two blocks, or no more links than blocks.
+    the links to which the models were fitted; if None, the models were fitted to the links of the other blocks. The
+    result is None if there are fewer than two blocks, or no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))

@@ -60,7 +60,7 @@ def validate(
     Args:
         study: The study, which may already be open; its engine must be "replay".
         blocks: Number of spatial blocks, each held out in turn. If `blocks` and `by` are None, the number in the study
-            applies, or 4 if the study states none.
+            applies, or 4 if the study does not state a number.
         by: Column of labels; all links with the same label are held out together. "tx" stands for the position of the
             transmitter.
         workers: Workers that trace and replay chunks of links (`engines.open_workers`). If None, this process does
