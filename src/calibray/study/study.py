@@ -353,8 +353,8 @@ def _matrix(live: LiveScene, measured: pd.DataFrame | ArrayLike) -> NDArray[np.f
                 raise InputError(f"measured: {what} {label!r} is repeated; give one {what} for each {kind}")
             if unknown := [str(label) for label in labels if label not in names]:
                 raise InputError(
-                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows must be transmitters, and "
-                    "columns are receivers"
+                    f"measured: {what} {unknown[0]!r} is not a {kind} of the scene; rows must be transmitters and "
+                    "columns must be receivers"
                 )
         measured = measured.reindex(index=list(live.tx), columns=list(live.rx)).to_numpy()
     elif isinstance(measured, str | Path):
