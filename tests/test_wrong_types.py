@@ -89,7 +89,7 @@ def test_columns_of_a_map_are_a_dictionary(result: cb.Result, columns: Any) -> N
     [
         ({"engine": "replay"}, r"engine: is 'replay', .* study\.replace\(engine=NAME\)"),
         ({"workers": 4}, r"workers: is 4, must be workers from engines\.open_workers"),
-        ({"cheap_model": "study.toml"}, "cheap_model: is 'study.toml', must be a Study"),
+        ({"cheap_model": "study.toml"}, "cheap_model: is 'study.toml'; it must be a Study"),
     ],
 )
 def test_arguments_of_a_calibration(study: cb.Study, arguments: dict, message: str) -> None:
@@ -192,7 +192,7 @@ def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Pa
     refused("conductivity: follows from ITU-R", lambda: cb.itu_material("concrete", 3e9, conductivity=1.0))
     refused("frequency = '3e9': must be from 1e", lambda: paths.at("3e9"))
     name = next(iter(paths.materials))
-    refused(f"material '{name}': is 5, must be a Material", lambda: cb.path_loss(paths, {name: 5}))
+    refused(f"material '{name}': is 5; it must be a Material", lambda: cb.path_loss(paths, {name: 5}))
 
 
 def test_links_of_arrays(result: cb.Result) -> None:

@@ -430,7 +430,7 @@ def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, m
 
 def test_the_name_of_a_file_is_no_study():
     with pytest.raises(
-        InputError, match=r"study: is a str, must be a Study; .* calibrate\(Study\.load\(file\)\)"
+        InputError, match=r"study: is a str; it must be a Study; .* calibrate\(Study\.load\(file\)\)"
     ):
         calibrate("study.toml")
 
@@ -444,7 +444,9 @@ def test_a_single_link_is_refused_before_the_search(tmp_path):
     study = two_ray.study(tmp_path, holdout={"where": "rx_x > 3.1"})
     setup = Setup.open(study, two_ray.TwoRay)
     engine = Replay(setup.trace(), setup.parameters, "coherent")
-    with pytest.raises(InputError, match=r"links\.csv: 1 calibration link has a path; at least 2 are needed"):
+    with pytest.raises(
+        InputError, match=r"links\.csv: only 1 calibration link has a path; at least 2 are needed"
+    ):
         calibrate(setup, engine=engine)
     assert engine.calls == 1
 

@@ -165,4 +165,4 @@ def test_a_small_address_space_is_named(tmp_path):
         ["sh", "-c", limited, sys.executable], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 2, done.stderr
-    assert "memory is short: the address space of this process is limited to 1.0 GiB" in done.stderr
+    assert "too little memory: the address space of this process is limited to 1.0 GiB" in done.stderr

@@ -275,7 +275,7 @@ def test_a_model_that_predictions_do_not_use_yet_is_named(folder, ran, tmp_path)
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
         (
             ("predict", "{result}", "{bare}", "-o", "{folder}/out.xlsx"),
-            "a table must end in .csv or .parquet",
+            "the name of a table must end in .csv or .parquet",
         ),
     ],
 )

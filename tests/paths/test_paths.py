@@ -227,7 +227,7 @@ def test_other_version_of_the_format(paths: Paths, tmp_path: Path) -> None:
         file.attrs["version"] = FORMAT_VERSION + 1
     with pytest.raises(
         InputError,
-        match=rf"version {FORMAT_VERSION + 1} of the format, must be {FORMAT_VERSION}; trace again",
+        match=rf"version {FORMAT_VERSION + 1} of the format, but must have version {FORMAT_VERSION}; trace again",
     ):
         Paths.load(tmp_path / "paths.h5")
 

@@ -230,7 +230,7 @@ TRACE = "max_depth = 4"
         ("refraction = true", "refraction = 1", "trace.refraction = 1: must be true or false"),
         ('"dipole"', '"dipol"', "antennas.tx: antenna pattern = 'dipol': must be"),
         ("[0.0, 0.0, 10.0]", "[0.0, 10.0]", "links.tx[2]: is required"),
-        ("[0.0, 0.0, 10.0]", "[0, 0, 0, 0]", "links.tx = [0, 0, 0, 0]: must have 3 entries, has 4"),
+        ("[0.0, 0.0, 10.0]", "[0, 0, 0, 0]", "links.tx = [0, 0, 0, 0]: must have 3 entries, but has 4"),
         ("[0.0, 0.0, 10.0]", "[0, 0, true]", "links.tx[2] = True: must be a number"),
         ('"received_power"', '"power"', "links.quantity = 'power': must be one of 'path_"),
         ('combining = "band"', 'combining = "sum"', "objective.combining = 'sum': must be one of 'power', "),

@@ -16,7 +16,7 @@ def test_a_library_that_cannot_be_loaded_is_not_called_missing(tmp_path, monkeyp
     )
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(
-        InputError, match=r"shaky is installed but cannot be loaded \(libgeos\.so: .*memory is short"
+        InputError, match=r"shaky is installed but cannot be loaded \(libgeos\.so: .*memory is low"
     ):
         library("shaky", "scenes")
     monkeypatch.setitem(sys.modules, "absent", None)

@@ -45,7 +45,7 @@ from calibray.validation.validate import check_engine, validate_problem
 _LOG: Final = logging.getLogger(__name__)
 
 
-# Ctrl-C during an import leaves half-initialized modules, whose errors would hide the interruption.
+# Ctrl-C during an import leaves modules half initialized, and errors of these modules would hide the interruption.
 @ensure_interruption()
 @unwrap_interruption()
 def calibrate(
@@ -63,23 +63,24 @@ def calibrate(
 ) -> Result:
     """Calibrate a scene's materials against measurements.
 
-    Suspicious positions and values of the links are logged as warnings. The links of a study that is already open are
-    not checked.
+    Suspicious positions and values of the links are logged as warnings. If the study is already open, its links are not
+    checked.
 
     Args:
-        study: The study; it may already be open.
-        method: Method to use instead of the study's: "auto", "sgwo-im", "gwo", ...
-        seed: Seed to use instead of the study's.
-        out: Folder to save the result in. It is checked before any computation. The ledger of RT calls is also written
-            there, so that a restarted run does not repeat completed calls; calls of a given `engine` are not stored.
+        study: The study, which may already be open.
+        method: Method to use instead of the method of the study: "auto", "sgwo-im", "gwo", ...
+        seed: Seed to use instead of the seed of the study.
+        out: Folder to save the result in, which is checked before any computation. The ledger of RT calls is also
+            written to this folder, so that a restarted run does not repeat completed calls. Calls of a given `engine`
+            are not stored.
         engine: Engine for all links of the study; if None, the engine that the study specifies. Predictions use the
             study's engine.
-        workers: Workers from `engines.open_workers`. They run the calls of a batch with the engine "command", or the
-            chunks of links with the engine "replay". If None, everything runs in this process.
+        workers: Workers from `engines.open_workers`, which run the calls of a batch (engine "command") or replay chunks
+            of links (engine "replay"). If None, everything runs in this process.
         progress: Called with the name of each stage, the completed work and the total.
         tracer: Function that opens the scene in a ray tracer; not used for an opened study.
         overwrite: Replace files in `out` even if Calibray did not write them; input files are never replaced.
-        cheap_model: A study with the same links and materials. Its replay is used as the cheap model of an expensive
+        cheap_model: A study with the same links and materials, whose replay is used as the cheap model of an expensive
             engine. If None, the study itself is replayed.
 
     Raises:
@@ -94,16 +95,17 @@ def calibrate(
     """
     if not isinstance(study, Study | Setup):
         raise InputError(
-            f"study: is a {type(study).__name__}, must be a Study; read a file first: calibrate(Study.load(file))"
+            f"study: is a {type(study).__name__}; it must be a Study; read a file first: "
+            "calibrate(Study.load(file))"
         )
     if not isinstance(engine, Engine | None):
         raise InputError(
-            f"engine: is {engine!r}, must be an engine for all links; to choose one by name, use "
+            f"engine: is {engine!r}; it must be an engine for all links; to choose an engine by name, use "
             "study.replace(engine=NAME)"
         )
     check_workers(workers)
     if not isinstance(cheap_model, Study | Setup | None):
-        raise InputError(f"cheap_model: is {cheap_model!r}, must be a Study, such as Study.load(file)")
+        raise InputError(f"cheap_model: is {cheap_model!r}; it must be a Study, such as Study.load(file)")
     replaced = study.replace(method=method, seed=seed)
     plan, setup = (replaced.study, replaced) if isinstance(replaced, Setup) else (replaced, None)
     check_method(plan.method.name)
@@ -130,10 +132,10 @@ def calibrate(
     problem = Problem.of(setup, engine)
     if problem.objective.num_counted < 2:
         raise InputError(
-            f"{setup.links.source}: 1 calibration link has a path; at least 2 are needed: measure more, "
+            f"{setup.links.source}: only 1 calibration link has a path; at least 2 are needed: measure more links, "
             "or change [holdout]"
         )
-    # With a given engine, this machine may have no ray tracer, which the check for enclosed antennas needs.
+    # If an engine is given, this machine may have no ray tracer, which the check for enclosed antennas needs.
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
     problem = with_preliminary_fits(problem, progress)
@@ -157,19 +159,21 @@ def calibrate(
         problem = replace(problem, setup=problem.setup.with_obstruction())
     validation = None
     if plan.holds_out_blocks:
-        # A method without a multi-start returns at most two minima, too few starting points for a validation.
+        # A method without multiple starts returns at most two minima, which are too few starting points for a
+        # validation.
         many = len(trail.minima) > 2
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
     start_stage(progress, "examining residuals")
     on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
-    # A wrong direction looks like a loss on one side of a transmitter, so regions are tested only if directions fit.
+    # A wrong antenna direction looks like a loss on one side of the transmitter, so regions are tested only if no
+    # direction is found to be wrong.
     on_links += directions_remark(problem, trail.best) or region_remark(problem, trail)
     on_links += groups_remark(problem, trail)
     remarks = (*given_engine_remark(setup, given), *of_rays, *on_links)
     run = Run(problem, trail, gap_db, cheap, enclosed, remarks, timing)
     result = make_result(run, assessment, validation)
     if out is not None:
-        # The folder was checked before the search; a file that has appeared since must not prevent saving.
+        # The folder was checked before the search; a file that has appeared since then must not prevent saving.
         result.save(out, overwrite=True)
     return result

@@ -1,9 +1,9 @@
-"""Accuracy on links held out by a filter or in blocks, choice of the prediction model, and its fallback.
+"""Accuracy on links held out by a filter or in blocks, choice of the prediction model, and fit of the fallback model.
 
-The fallback is a log-distance model with the study's nuisances. It is fitted to the calibration links, like the
-log-distance baseline in validation. Links without a path are behind obstacles, so their path loss usually exceeds the
-prediction of this fit. If enough of these links, or else enough links out of sight, were measured, their mean residual
-is added to the prediction. Their scatter then determines the fallback's errors.
+The fallback is a log-distance model with the study's nuisances. The fallback is fitted to the calibration links, like
+the log-distance baseline in validation. Links without a path are behind obstacles, so their path loss usually exceeds
+the prediction of the fallback. If enough links without a path were measured, or else enough links out of sight, their
+mean residual is added to the prediction. The scatter of these links then determines the errors of the fallback.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Models:
 
 
 def rmse_of(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
-    """RMSE [dB] of modelled path loss [L] over the calibration links in a mask [L], weighted as in the fit."""
+    """RMSE [dB] of modelled path loss [L] over the calibration links in a mask [L], with the weights of the fit."""
     weight = problem.objective.weight[mask]
     return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
 
@@ -63,7 +63,7 @@ def rmse_of(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_
 def held_out_rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
     """RMSE [dB] of modelled path loss [L] over the held-out links in a mask [L]; None if the mask is empty.
 
-    All links have equal weight, as in the judgement and in prediction intervals.
+    All links have equal weight, as in the comparison of models and in prediction intervals.
     """
     errors = (model - problem.objective.measured)[mask]
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else None
@@ -72,7 +72,7 @@ def held_out_rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np
 def on_held_out_links(
     problem: Problem, trail: Trail, models: Models
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
-    """Accuracy on links held out by a filter, the name of the chosen prediction model, and its residuals."""
+    """Accuracy on links held out by a filter, name of the chosen prediction model, and residuals of this model."""
     objective, links = problem.objective, problem.setup.links
     fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
@@ -101,7 +101,7 @@ def on_held_out_links(
 
 
 def _compared(problem: Problem, models: Models) -> dict[str, NDArray[np.float64]]:
-    """Path loss of all links according to the calibrated model and every baseline [links], [dB]."""
+    """Path loss [dB] of all links [links] according to the calibrated model and every baseline."""
     objective, setup = problem.objective, problem.setup
     return {
         Model.INITIAL: initial_objective(objective, setup).with_nuisance(problem.before),
@@ -113,9 +113,10 @@ def _compared(problem: Problem, models: Models) -> dict[str, NDArray[np.float64]
 def _choice(
     problem: Problem, trail: Trail, modelled: dict[str, NDArray[np.float64]], judged: NDArray[np.bool_]
 ) -> tuple[str, HeldOutResiduals]:
-    """Name of the model chosen on held-out links, and its residuals; with too few links, the calibrated model.
+    """Name and residuals of the model chosen on held-out links; with too few links, the calibrated model is chosen.
 
-    `modelled` contains the path loss of the compared models. It is empty if no held-out link can be judged.
+    `modelled` contains the path loss of the compared models. This dictionary is empty if no held-out link can be
+    judged.
     """
     objective, setup = problem.objective, problem.setup
     # Kriging is never chosen.
@@ -132,7 +133,7 @@ def _choice(
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
         ends = np.hstack([setup.links.tx, setup.links.rx])
-        # These links were held out together; blocks serve only to separate errors within blocks from those between
+        # These links were held out together; the blocks serve only to separate errors within blocks from errors between
         # blocks.
         block = place_blocks(moving_end(setup.links)[judged][finite], DEFAULT_BLOCKS)
         levels = two_levels(errors[name], block, ends[judged][finite], ends[objective.weight > 0])
@@ -148,7 +149,7 @@ def _choice(
         return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
     rms_db, errors_db = None, objective.model(trail.best_modelled[None])[0] - objective.measured
     if problem.freedom >= 1:
-        # A new link has no weight, so these links count equally, as held-out links do.
+        # A new link has no weight, so all calibration links count equally here, as held-out links do.
         rms_db = float(np.sqrt(np.sum(errors_db[objective.weight > 0] ** 2) / problem.freedom))
     basis = f"errors of {objective.num_counted} calibration links"
     return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, max(round(problem.freedom), 1), np.zeros(0))
@@ -157,7 +158,7 @@ def _choice(
 def log_distance_errors(
     problem: Problem, models: Models, validation: Validation | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Residuals of the log-distance model on held-out links with a path [n], [dB], and their description."""
+    """Residuals [dB] of the log-distance model on held-out links with a path [n], and a label for the residuals."""
     if validation is not None:
         basis = f"errors on {len(validation.labels)} blocks held out in turn"
         return validation.errors[Model.LOG_DISTANCE][validation.judged], basis
@@ -171,7 +172,7 @@ def log_distance_errors(
 def on_blocks(
     validation: Validation, problem: Problem, initial_db: float | None, fitted: bool
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
-    """Accuracy on blocks held out in turn, the name of the chosen prediction model, and its residuals."""
+    """Accuracy on blocks held out in turn, name of the chosen prediction model, and residuals of this model."""
     rmse = validation.table["rmse_db"]
     name, judged = validation.chosen, validation.judged
     levels = validation.levels(name, problem.setup.links)
@@ -203,7 +204,7 @@ def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """Ratio of the errors of links out of sight to those of all links; 1 if unknown or modelled by a nuisance."""
+    """Ratio of the errors of links out of sight to the errors of all links; 1 if unknown or modelled by a nuisance."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
@@ -220,9 +221,9 @@ def fit_fallback(
 ) -> PredictionModel:
     """Fit the fallback, the log-distance model, to the calibration links.
 
-    The errors of the fallback come from links without a path. If there are too few, they come from links out of sight,
-    some of which are near the noise floor, like links without a path. If there are too few of these as well, the
-    residuals on held-out links [n], [dB], are used, which `basis` describes. Without enough held-out links, the
+    The errors of the fallback come from links without a path. If too few links have no path, the errors come from links
+    out of sight, some of which are near the noise floor, like links without a path. If too few links are out of sight,
+    the residuals on held-out links [n], [dB], are used; `basis` describes them. Without enough held-out links, the
     residuals on the calibration links are used.
     """
     setup, links = problem.setup, problem.setup.links
@@ -232,7 +233,7 @@ def fit_fallback(
     measured = ~setup.held_out if links.censored is None else ~setup.held_out & ~links.censored
     usable, name = without_path & measured, WITHOUT_PATH
     usable = usable if problem.faint is None else usable & ~problem.faint
-    # Lines of sight take time, so they are computed only if needed.
+    # Lines of sight take time to compute, so they are computed only if needed.
     if usable.sum() < FEW and OUT_OF_SIGHT in (table := setup.with_obstruction().links.table).frame:
         usable, name = (table.numbers(OUT_OF_SIGHT) > 0) & measured, OUT_OF_SIGHT.replace("_", " ")
     count = int(usable.sum())
@@ -247,7 +248,7 @@ def fit_fallback(
     else:
         counted = objective.weight > 0
         count, unknowns = int(counted.sum()), int(objective.determined.sum())
-        # In-sample errors are too small, because the unknowns were fitted to the same links.
+        # Errors on the calibration links are too small, because the unknowns were fitted to the same links.
         inflation = np.sqrt(count / (count - unknowns)) if count > unknowns else np.nan
         errors = residuals[counted] * inflation
         errors, basis = errors[np.isfinite(errors)], f"errors of {count} calibration links"

@@ -1,8 +1,8 @@
 """Diagnostics of the links of a finished calibration.
 
-The diagnostics are the leverage and depth of links, power by material and interaction, and tracer settings that find
-paths for links without one. Tests show whether a missing region, groups of links or other antenna directions explain
-the residuals.
+The diagnostics are the leverage and depth of links, the power by material and interaction, and the tracer settings that
+find paths for links without a path. Further tests show whether a missing region, groups of links or other antenna
+directions explain the residuals.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from calibray.uncertainty.missing_region import missing_region
 from calibray.validation.held_out_statistics import CLUSTER_LINKS, MOST_CLUSTERS, spatial_blocks
 
 DENSE: Final = 20_000_000
-"""Largest number of entries in the nuisances' design matrix for which leverage is computed. A matrix of this size takes
-160 MB."""
+"""Maximum number of entries in the design matrix of the nuisances for which leverage is computed. A matrix of this size
+takes 160 MB."""
 
 DIRECT: Final = "line of sight"
 """Label of the power share of paths without interactions."""
@@ -54,7 +54,8 @@ class LinkDiagnostics:
         columns: Columns for the table of links: `leverage` (NaN for a link of weight 0) and `depth`, the number of
             interactions of the strongest path (NaN for a link without a path).
         power_shares: Share of a link's power on paths with a given material and kind of interaction, averaged over the
-            links. A path counts in full for every such pair on it, so the sum of the shares can exceed 1.
+            links. A path counts in full for every pair of material and kind on the path, so the sum of the shares can
+            exceed 1.
     """
 
     columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -93,7 +94,7 @@ def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | N
 
 
 def _at_one_carrier(problem: Problem) -> bool:
-    """Whether all paths are replayed, uncompressed, with the constants at the study's carrier."""
+    """Whether all paths are replayed without compression, at the constants of the study's carrier."""
     compressed = getattr(problem.setup.study.engine, "compress_db", None) is not None
     return not (compressed or problem.parameters.has_laws or problem.setup.links.frequency is not None)
 
@@ -109,7 +110,7 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
         design = np.zeros((len(rows), columns))
         if columns:
             design[:count] = objective.nuisance.design[counted].toarray() * root[:, None]
-            # The rows of priors follow; they partly determine the coefficients.
+            # Further rows contain the priors, which partly determine the coefficients.
             ridge = objective.noise_db / objective.nuisance.prior
             design[count : objective.num_rows] = np.diag(ridge)[ridge > 0]
         result[counted] = leverage(rows, design)[:count]
@@ -120,9 +121,9 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
     """Leverage of each link [m]: the derivative of its modelled value with respect to its own measurement.
 
     Leverage is the diagonal of the projection onto two sets of columns: the derivatives of the residuals, with the
-    nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. It is 0 for a link
-    without influence and 1 for a link that alone determines an unknown. Its sum over all rows, including those of
-    priors, is the number of unknowns that the rows determine.
+    nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. Leverage is 0 for a
+    link without influence and 1 for a link that alone determines an unknown. The sum of leverage over all rows,
+    including the rows of priors, is the number of unknowns that the rows determine.
 
     Example:
         >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()
@@ -133,7 +134,7 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
         size = np.linalg.norm(columns, axis=0)
         used = columns[:, size > 0] / size[size > 0]
         basis, values, _ = np.linalg.svd(used, full_matrices=False)
-        # Columns that depend on others add nothing to the projection.
+        # Columns that are linear combinations of others add nothing to the projection.
         total += np.sum(basis[:, values > 1e-6] ** 2, axis=1)
     return np.minimum(total, 1.0)
 
@@ -144,7 +145,7 @@ class _Power(NamedTuple):
     Attributes:
         depth: Number of interactions of every link's strongest path [L].
         power: Shares of the links' power by material and kind of interaction, summed over the links [M + 1, kinds]. The
-            first element of the last row is the share without interactions.
+            first element of the last row is the share of paths without interactions.
         reached: Number of links with power.
     """
 
@@ -158,11 +159,11 @@ def _depth_and_power(paths: Paths, materials: dict[str, Material]) -> _Power:
     power = np.sum(np.abs(gain) ** 2, axis=tuple(range(1, gain.ndim)))
     count, order = np.diff(paths.first), np.lexsort((power, paths.link))
     depth = np.full(paths.num_links, np.nan)
-    # The last of a link's paths in this order is its strongest.
+    # The last path of a link in this order is the link's strongest path.
     depth[paths.link[order]] = count[order]
     total = np.bincount(paths.link, power, paths.num_links)
     part = power / np.where(total > 0, total, np.inf)[paths.link]
-    # One code per pair of material and kind; a path counts once for each pair on it.
+    # Each pair of material and kind has one code; a path counts once for each pair that occurs on the path.
     kinds = max(Kind) + 1
     path_of = np.repeat(np.arange(paths.num_paths), count)
     path_index, codes = np.unique(
@@ -179,18 +180,18 @@ def _chunk_power(chunk: Chunk, materials: dict[str, Material]) -> _Power:
 
 
 FEWEST_CLUSTERS: Final = 8
-"""Smallest number of clusters with links both inside and outside a group for the group to be tested."""
+"""Minimum number of clusters with links both inside and outside a group; a group with fewer is not tested."""
 
 MIXED: Final = 0.5
-"""Smallest share of the variance of membership that must lie within clusters for a group to be tested; with a smaller
-share, the group is a location."""
+"""Minimum share of the variance of group membership within clusters for a group to be tested; a group with a smaller
+share is a location."""
 
 SIGNIFICANCE: Final = 0.01
-"""Probability of a false remark about any group of any column, or about any antenna direction."""
+"""Probability of a false alarm about any group of any column, or about any antenna direction."""
 
 SMALLEST_DB: Final = 0.05
-"""Smallest improvement of the RMSE for which a group or a direction is reported [dB]; smaller improvements do not
-change predictions noticeably."""
+"""Minimum improvement of the RMSE for which a group or a direction is reported [dB]; smaller improvements do not change
+predictions noticeably."""
 
 
 @dataclass(frozen=True)
@@ -200,9 +201,10 @@ class Difference:
     Attributes:
         column: The column.
         label: Label of the group in this column.
-        difference_db: Mean residual of the group minus that of its neighbours [dB].
+        difference_db: Mean residual of the group minus the mean residual of its neighbours [dB].
         error_db: Standard error [dB].
-        chance: Probability of a difference at least this significant by chance, times the number of tested groups.
+        chance: Probability that chance alone causes a difference at least as significant, times the number of tested
+            groups.
     """
 
     column: str
@@ -218,10 +220,10 @@ def differing_groups(
     """Find groups of links, such as those of one device, whose residuals differ significantly from those of neighbours.
 
     Only neighbouring links of one transmitter are compared: residuals and group membership are taken relative to their
-    means over clusters of such links. A column that is constant over a neighbourhood, such as the name of a street,
-    therefore shows no difference, and errors that neighbours share cancel. Each cluster counts as one observation of
-    the difference, so that correlated errors within a cluster are not treated as independent (K.-Y. Liang, S. L. Zeger,
-    Biometrika 73, 1986). The most significant group comes first.
+    means over clusters of neighbouring links. A column that is constant over a neighbourhood, such as the name of a
+    street, therefore shows no difference, and errors that neighbours share cancel. Each cluster counts as one
+    observation of the difference, so that correlated errors within a cluster are not treated as independent (K.-Y.
+    Liang, S. L. Zeger, Biometrika 73, 1986). The most significant group comes first.
 
     Args:
         residual_db: Residuals [n], [dB].
@@ -245,11 +247,11 @@ def differing_groups(
             mixed = int(np.count_nonzero(square))
             if mixed < FEWEST_CLUSTERS or square.sum() < MIXED * variance * len(member):
                 continue
-            # Regression of residuals on membership, both relative to their clusters.
+            # Regression of residuals on group membership, both relative to their means over clusters.
             difference = float(inside @ residual / square.sum())
             score = np.bincount(cluster, inside * residual) - square * difference
             error = float(np.sqrt(np.sum(score**2) * mixed / (mixed - 1)) / square.sum())
-            # An offset of the group removes this part of the mean square.
+            # An offset for the group removes this part of the mean square.
             improved = np.sqrt(mean_square) - np.sqrt(max(mean_square - variance * difference**2, 0.0))
             chance = 1.0
             if improved >= SMALLEST_DB:
@@ -262,17 +264,17 @@ def differing_groups(
 
 
 SHARE: Final = 0.02
-"""Smallest share of links without a path for which other tracer settings are tried; a smaller share hardly changes the
+"""Minimum share of links without a path for which other tracer settings are tried; a smaller share hardly affects the
 fit."""
 
 FEWEST: Final = 5
-"""Smallest number of links without a path for which other tracer settings are tried."""
+"""Minimum number of links without a path for which other tracer settings are tried."""
 
 
 def unreached_remark(problem: Problem, progress: Progress | None = None) -> tuple[Remark, ...]:
-    """Count the links without a path, and test on a sample which tracer settings find a path for them.
+    """Count the links without a path, and test which tracer settings find paths for a sample of these links.
 
-    There is no remark if nearly all links have a path or if nothing can be traced. `progress` is called with the stage
+    No remark is made if nearly all links have a path or if nothing can be traced. `progress` is called with the stage
     "links without a path".
     """
     setup, usable = problem.setup, np.ones(len(problem.setup.links), dtype=bool)
@@ -305,7 +307,7 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
 
 
 def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) -> int:
-    """Number of links in the sample that have a path with changed tracer settings."""
+    """Number of links in the sample that have a path when the tracer settings are changed."""
     mask = np.isin(np.arange(len(setup.links)), sample)
     changed = setup.with_trace(replace(setup.study.trace, **change))
     paths = changed.at(setup.links.select(mask)).trace()
@@ -313,18 +315,18 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
 
 
 MOST_NUMBERS: Final = 12
-"""Largest number of distinct values for which a numeric column, such as days or floors, can label groups."""
+"""Maximum number of distinct values in a numeric column, such as days or floors, whose values can label groups."""
 
 SIGNAL_CORRELATION: Final = 0.5
 """Magnitude of the rank correlation with path loss above which whole numbers are taken for signal levels, not
 labels."""
 
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
-"""Smallest number of links of a transmitter for which its direction, which has two angles, is tested."""
+"""Minimum number of links for which the direction of a transmitter is tested; a direction has two angles."""
 
 MOST: Final = 50
-"""Largest number of transmitters that are tested; those with the most links are chosen. Each requires three derivatives
-of every link."""
+"""Maximum number of transmitters that are tested; those with the most links are chosen. Each transmitter requires three
+derivatives of every link."""
 
 
 class Direction(NamedTuple):
@@ -337,7 +339,7 @@ class Direction(NamedTuple):
 
 
 def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
-    """Test whether the loss in a region, such as unmapped trees, would explain the residuals of a calibration.
+    """Test whether losses in a region, such as one with unmapped trees, would explain the residuals of a calibration.
 
     The links must have positions. A common loss of links out of sight is fitted first.
     """
@@ -356,7 +358,7 @@ def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 
 
 def _excess_db(problem: Problem, trail: Trail) -> NDArray[np.float64]:
-    """Measured minus modelled path loss of all links at the optimum [L], [dB], without weights."""
+    """Measured minus modelled path loss of all links at the optimum [L], [dB], unweighted."""
     return problem.objective.measured - problem.objective.model(trail.best_modelled[None])[0]
 
 
@@ -414,7 +416,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 
     For each transmitter, an F test adds two columns to a model with the parameters, the nuisance and a gain of the
     transmitter. These columns are the derivatives of path loss with respect to azimuth and downtilt at the calibrated
-    values [d]. The remark names the transmitters. Without stored paths, there is no remark.
+    values [d]. The remark names the transmitters. No remark is made if no paths are stored.
     """
     setup, engine = problem.setup, problem.engine
     study, table = setup.study, setup.links.table
@@ -452,7 +454,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """The evaluation, with derivatives for the transmitters' directions and gains, and each parameter's column."""
+    """The evaluation, with derivatives for the transmitters' directions and gains, and the column of each parameter."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}
@@ -480,7 +482,7 @@ def _derivatives(
 
 @dataclass(frozen=True)
 class _Posed:
-    """Makes the replay of a chunk's paths for another opened study."""
+    """Makes a replay of a chunk's paths for another opened study."""
 
     study: Shared[Setup]
 
@@ -491,7 +493,7 @@ class _Posed:
 def _direction(
     evaluation: Evaluation, columns: dict[str, int], label: str, freedom: int, significance: float
 ) -> Direction | None:
-    """The change of direction that explains the residuals of one transmitter; None if it is not significant."""
+    """The change of direction that explains the residuals of one transmitter; None if the change is not significant."""
     residuals, slopes = evaluation.residuals[0], evaluation.slopes[0]
     own = [columns[f"{POSE}{label}.{field}"] for field in ("azimuth", "downtilt", "gain")]
     common = [column for name, column in columns.items() if not name.startswith(POSE)]
@@ -500,7 +502,7 @@ def _direction(
     step, _, full_rank, _ = np.linalg.lstsq(turned, -residuals, rcond=None)
     before = float(np.sum((residuals + stated @ without) ** 2))
     after = float(np.sum((residuals + turned @ step) ** 2))
-    # An angle that the other columns can replace adds no rank.
+    # An angle whose column is a linear combination of the other columns does not increase the rank.
     further, left = int(full_rank - rank), freedom - 1 - int(full_rank - rank)
     improvement = (np.sqrt(before) - np.sqrt(after)) / np.sqrt(len(residuals))
     if further < 1 or left < 1 or improvement < SMALLEST_DB:

@@ -59,7 +59,7 @@ from calibray.validation.models import log_distance, without_scene
 from calibray.validation.validation import Validation
 
 WORSE_DB: Final = 0.05
-"""Excess over the RMSE of the initial values above which a remark is made [dB]."""
+"""A remark is made if the RMSE exceeds that of the initial values by more than this value [dB]."""
 
 FAINT: Final = "predicted too near the noise floor, left out"
 """Label, in the row counts, of links that the model predicts near the noise floor."""
@@ -67,7 +67,7 @@ FAINT: Final = "predicted too near the noise floor, left out"
 
 @dataclass(frozen=True)
 class Timing:
-    """Durations of the search and of the loading and tracing before it, and the start time of the run [s]."""
+    """Durations of the search and of the preceding loading and tracing, and the start time of the run [s]."""
 
     search: float
     trace: float
@@ -81,10 +81,10 @@ class Run:
     Attributes:
         problem: The problem, with the paths of the last trace.
         trail: The search.
-        retrace_gap_db: Change of every link's path loss when the scene is traced again [links], [dB]; None if it is not
-            traced again.
+        retrace_gap_db: Change of every link's path loss when the scene is traced again [links], [dB]; None if the scene
+            is not traced again.
         cheap: The cheap model, if the method used one.
-        enclosed: Antennas inside closed bodies; None if this was not checked.
+        enclosed: Antennas inside closed bodies; None if the antennas were not checked.
         on_links: Remarks on ray mapping, links without a path, antenna directions, missing regions and groups of links.
         timing: Durations of the parts of the run.
     """
@@ -145,7 +145,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
     chosen = fit_prediction_model(problem, trail, name, residuals, gap_db)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
     prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table, validation))
-    # The ceiling, if there is one, predicts links without a path.
+    # If the study has a ceiling, the ceiling is the prediction for links without a path.
     if chosen.model.parameters is not None and objective.ceiling_db is None:
         without_path = ~table["has_path"].to_numpy(bool)
         fallback = fit_fallback(problem, without_path, *log_distance_errors(problem, models, validation))
@@ -209,7 +209,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
 def _retraced(
     gap_db: NDArray[np.float64] | None, counted: NDArray[np.bool_], tolerance_db: float
 ) -> tuple[Remark, ...]:
-    """A remark if the path loss of any link [L] changes by more than the tolerance in a new trace."""
+    """A remark if the path loss of any link [L] changes by more than the tolerance when the scene is traced again."""
     if gap_db is None or not (np.abs(gap_db[counted]) > tolerance_db).any():
         return ()
     change_db = np.abs(gap_db[counted])
@@ -224,7 +224,7 @@ def _retraced(
 
 
 def given_engine_remark(setup: Setup, engine: Engine | None) -> tuple[Remark, ...]:
-    """A remark on an engine that the user wrote, if one was given, because predictions use that of the study."""
+    """A remark if the user passed an engine of their own; predictions nevertheless use the engine of the study."""
     if engine is None or type(engine).__module__.partition(".")[0] == __name__.partition(".")[0]:
         return ()
     values: dict[str, Value] = {"engine": type(engine).__name__, "used": setup.study.engine.name}
@@ -232,7 +232,7 @@ def given_engine_remark(setup: Setup, engine: Engine | None) -> tuple[Remark, ..
 
 
 def _lost_paths(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
-    """A remark if links without a path make the objective infinite at some candidates; failed calls do not count."""
+    """A remark if links without a path make the objective infinite at any candidate; failed calls do not count."""
     if problem.setup.study.engine.exports_rays or not trail.modelled:
         return ()
     reached = np.isfinite(trail.modelled)
@@ -251,7 +251,7 @@ def _lost_paths(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float64]) -> tuple[Remark, ...]:
     """A remark if the initial values, with path loss `start_db` [L], fit better than the method's best candidate.
 
-    With priors or further observables, the method minimises more than the RMSE of path loss, so there is no remark.
+    With priors or further observables, the method minimises more than the RMSE of path loss, so no remark is made.
     """
     study = problem.setup.study
     priors = [entry.prior for entry in (*study.parameters.values(), *study.nuisance_terms.values())]
@@ -291,7 +291,7 @@ def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:
 
 
 def _faint_rows(problem: Problem) -> dict[str, int]:
-    """Number of links above the noise floor that are left out because the model predicts them near it."""
+    """Number of links above the noise floor that are left out because the model predicts them near the noise floor."""
     faint, censored = problem.faint, problem.setup.links.censored
     count = 0 if faint is None else int((faint if censored is None else faint & ~censored).sum())
     return {FAINT: count} if count else {}
@@ -302,7 +302,7 @@ def _residual_field(
 ) -> ResidualField | None:
     """The correlated part of the prediction model's residuals.
 
-    None if the residuals are uncorrelated, or if this part does not improve predictions of held-out blocks.
+    None if the residuals are uncorrelated, or if the correlated part does not improve predictions of held-out blocks.
     """
     if validation is not None and Model.RESIDUAL_FIELD in validation.errors:
         rmse_db = validation.table["rmse_db"]
@@ -343,7 +343,7 @@ def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
 def _as_measured(
     study: StudyModel, links: Measurements, table: pd.DataFrame
 ) -> dict[str, NDArray[np.float64]]:
-    """Columns in the measured quantity, path gain or received power; none if path loss was measured."""
+    """Columns in the measured quantity, which is path gain or received power; no columns if path loss was measured."""
     quantity, column = study.links.quantity, study.links.value
     if quantity == "path_loss" or column not in links.frame:
         return {}
@@ -366,10 +366,10 @@ def _replayed_paths(problem: Problem) -> Paths | None:
 def observable_fits(
     run: Run, draws: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
-    """The fit of every further observable by name, and its columns in the table of links.
+    """The fit of every further observable by name, and the columns of the observables in the table of links.
 
     The columns are the measured, initial and calibrated values and the biases [L], in the unit of the observable.
-    `draws` contains the posterior draws by parameter; it may be empty.
+    `draws` contains the posterior draws by parameter and may be empty.
     """
     problem = run.problem
     if not problem.observed:
@@ -415,7 +415,7 @@ def observable_fits(
             f"{observable.name}_after_{unit}": after[index] / observable.scale,
         }
         if observable.labels:
-            # The last element belongs to index -1, a link without a bias.
+            # The last element belongs to the index -1, which marks a link without a bias.
             known = np.append(np.isin(np.arange(len(observable.labels)), groups), False)
             of_links = np.append(biases[0], np.nan)[observable.group]
             columns[f"{observable.name}_bias_{unit}"] = np.where(known[observable.group], of_links, np.nan)

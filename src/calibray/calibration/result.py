@@ -1,4 +1,4 @@
-"""The result of a calibration: its record, and methods to store, show, predict, suggest and export."""
+"""The result of a calibration: a record, with methods to store, show, predict, suggest and export."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers
     from calibray.prediction.coverage_map import CoverageMap
 
-# Methods that trace or evaluate paths import what they need themselves, so that a stored result is shown quickly.
+# Methods that trace or evaluate paths import modules only when they are called, so that a stored result is shown
+# quickly.
 
 
 @final
@@ -43,7 +44,8 @@ class Result(Record):
         """Read a result that `save` wrote; with `allow_changed_inputs`, also one whose files were edited.
 
         Raises:
-            InputError: The folder contains no result, or the result is from another version, damaged or edited.
+            InputError: The folder contains no result, or the result was written by another version, is damaged, or was
+                edited.
         """
         return cls(**files.read(folder, allow_changed_inputs=allow_changed_inputs))
 
@@ -59,7 +61,7 @@ class Result(Record):
 
     @property
     def diagnostics(self) -> dict[str, pd.DataFrame]:
-        """Residuals, leverage, power, trade-offs and neighbours as tables; see `calibray.reporting.diagnostics`."""
+        """Tables of residuals, leverage, power, trade-offs and neighbours; see `calibray.reporting.diagnostics`."""
         return diagnostics.diagnostics(self)
 
     def content(self) -> dict[str, Any]:
@@ -70,10 +72,11 @@ class Result(Record):
         """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
 
         After a validation, `result-validation.json` is also written. Every file is written completely or not at all.
-        The folder is created if absent; `overwrite` also replaces files that Calibray did not write.
+        The folder is created if it does not exist. With `overwrite`, files that Calibray did not write are also
+        replaced.
 
         Raises:
-            InputError: The folder cannot be written, or a file there must not be replaced.
+            InputError: The folder cannot be written to, or a file in it must not be replaced.
         """
         validation = None if self.validation is None else self.validation.content()
         files.write(self, folder, overwrite, sentences=self.remarks, validation=validation)
@@ -90,12 +93,12 @@ class Result(Record):
         Args:
             links: The links, or a table of links. Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or the
                 position columns that the study names, and the study's group column, if any. The study's frequency
-                column contains the carriers; without it, all links have the scene's carrier.
+                column contains the carriers; without this column, all links have the scene's carrier.
             progress: Called with the stage "tracing" after every launch.
             allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            Path loss with nuisances [links], [dB]; the prediction of the fallback for a link without a path.
+            Path loss with nuisances [links], [dB]; for a link without a path, the prediction of the fallback.
 
         Raises:
             InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
@@ -122,13 +125,13 @@ class Result(Record):
             allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
 
         Returns:
-            One row per link, with the index of the table: path_loss_db, lower_db and upper_db [dB]; the same three in
-                the measured quantity if that is not path loss; basis, the source of the interval; and remark, a warning
-                about an unlikely antenna position or an unusually weak link.
+            One row per link, with the index of the table: path_loss_db, lower_db and upper_db [dB]; the same three
+            columns in the measured quantity if path loss was not measured; basis, the source of the interval; and
+            remark, a warning about an unlikely antenna position or an unusually weak link.
 
         Raises:
-            InputError: `predict` would refuse the links for a reason other than unknown groups; the level is not
-                between 0 and 1; or the calibration had too few links to estimate the size of residuals.
+            InputError: `predict` would refuse the links for a reason other than unknown groups, the level is not
+                between 0 and 1, or the calibration had too few links to estimate the spread of residuals.
         """
         from calibray.prediction.predict import predict_interval
 
@@ -187,9 +190,9 @@ class Result(Record):
     def apply(self, scene: object) -> None:
         """Set the materials in a `sionna.rt.Scene` in memory, at the study's carrier.
 
-        These are `scene_materials`, as in exports: those of the prediction model, or the calibrated ones if it uses no
-        scene. If the scene has a different carrier, a warning states both carriers. Unlike the constants of ITU
-        materials, these constants do not change when `scene.frequency` is set.
+        As in exports, these are `scene_materials`: the materials of the prediction model, or the calibrated materials
+        if that model uses no scene. If the scene has a different carrier, a warning states both carriers. Unlike the
+        constants of ITU materials, these constants do not change when `scene.frequency` is set.
 
         Raises:
             InputError: The object is not a Sionna RT scene, or the scene lacks a material.

@@ -1,11 +1,11 @@
-"""Geometry of traced paths: computation of the constants of the path program from vertices and normals.
+"""Geometry of traced paths: computes the constants of the path program from vertices and normals.
 
-The field of a path is a Jones vector. Each interaction has a frame for this vector. The first axis is s = k x n / |k x
-n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT expresses the field in the basis
-(theta, phi) of the direction of travel. This module combines the rotation from one interaction's frame to this basis
-with the rotation from this basis to the next frame. The conventions are those of Sionna RT (reference near the poles,
-orientation of normals and wedges, mirrored instead of traced direction after a reflection), so path gains also agree in
-phase.
+The field of a path is a Jones vector. Each interaction defines a frame for the Jones vector. The first axis of the
+frame is s = k x n / |k x n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT
+expresses the field in the basis (theta, phi) of the direction of travel. This module combines two rotations: from the
+frame of one interaction into the basis (theta, phi), and from there into the frame of the next interaction. All
+conventions are those of Sionna RT, so path gains also agree in phase. These conventions concern the reference near the
+poles, the orientation of normals and wedges, and the direction after a reflection, which is mirrored instead of traced.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Chains:
         samples: Number of rays launched per source.
         edge: Directions of the diffracting edges [P, D, 3], read only at diffractions; empty without diffraction.
         normal_n: Normals of the n-faces of the wedges [P, D, 3], read only at diffractions.
-        edge_lengths: Path lengths s' from the source to an edge, and s from this edge to the next one or to the target
+        edge_lengths: Path lengths s' from the source to an edge, and s from this edge to the next edge or to the target
             [P, D, 2], [m], read only at diffractions.
     """
 
@@ -54,13 +54,13 @@ class Chains:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The geometric part of a path program, with the names and shapes of `calibray.paths.Paths`.
+    """The geometric part of a path program; names and shapes are those of `calibray.paths.Paths`.
 
     Attributes:
         delay: Propagation delay [P], [s].
         spreading: Amplitude spreading [P], [1/m].
         departure_direction: Unit vector of departure [P, 3].
-        arrival_direction: Unit vector of travel at the target [P, 3].
+        arrival_direction: Unit vector of the direction of travel at the target [P, 3].
         departure_rotation: (cos, sin) of the rotation from the basis (theta, phi) of departure into the first frame [P,
             2].
         arrival_rotation: (cos, sin) of the rotation from the last frame into the basis (theta, phi) of arrival [P, 2].
@@ -112,7 +112,7 @@ def compile_chains(chains: Chains) -> Geometry:
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     # Path length up to the start of the ray tube; a diffuse reflection starts a new ray tube.
     tube_start = np.zeros(count)
-    # 1/sqrt(s s' (s + s')) where one edge diffracts, else 0
+    # spreading of diffracted paths, 1/sqrt(s s' (s + s')) for a single edge; 0 for all other paths
     spread = np.zeros(count)
     travelled = segment[:, 0].copy()
     for step in range(depth):
@@ -170,7 +170,7 @@ def compile_chains(chains: Chains) -> Geometry:
         travelled[row] += segment[row, step + 1]
 
     last = direction[np.arange(count), length]
-    # 1 / r from the start of the ray tube, or the spreading of the diffraction
+    # the spreading of the diffraction if there is one, otherwise 1 / r from the start of the ray tube
     spread = np.where(spread > 0, spread, 1 / (total - tube_start))
     flat = present.reshape(-1)
     return Geometry(
@@ -228,7 +228,7 @@ def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float
 def rotate(
     direction: NDArray[np.float64], current: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(cos, sin) [..., 2] of the rotation of the frame of a Jones vector about the direction of travel.
+    """(cos, sin) [..., 2] of the angle that rotates the frame of a Jones vector about the direction of travel.
 
     The vector (a, b) becomes (cos a + sin b, -sin a + cos b). `current` and `target` are the first axes of both frames
     [..., 3].
@@ -240,7 +240,7 @@ def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]; the azimuth is 0 near the poles."""
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
-    # As in `spherical_basis`; rounding errors would otherwise give a vertical path an arbitrary azimuth.
+    # Without this threshold, as in `spherical_basis`, rounding errors would give a vertical path an arbitrary azimuth.
     return np.stack([np.arctan2(rho, z), np.where(rho < 1e-6, 0.0, np.arctan2(y, x))], axis=-1)
 
 
@@ -269,8 +269,8 @@ def _wedge(
 ) -> tuple[NDArray[np.float64], ...]:
     """Constants of a wedge diffraction, in the conventions of Sionna RT.
 
-    With distances s and s' to the edge, `distance` is s s' / (s + s').
-    The results are the columns of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
+    `distance` is s s' / (s + s'), where s and s' are the distances to the edge. The function returns the columns of
+    `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
     """
     # Both normals point out of the wedge, so its interior angle is arccos(-n_0 . n_n).
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
@@ -302,7 +302,8 @@ def _azimuth(
     away: NDArray[np.float64], tangent: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Azimuth in [0, 2 pi), measured from the 0-face, of a direction that points away from the edge."""
-    # arccos alone gives the angle in front of the plane of the 0-face; behind it, the azimuth is 2 pi minus that.
+    # The angle from arccos is the azimuth in front of the plane of the 0-face; behind this plane, the azimuth is 2 pi
+    # minus the angle.
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
 
@@ -316,7 +317,7 @@ def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 def _in_path_order(
     parts: list[tuple[NDArray[Any], ...]], empty: Diffuse | Diffraction
 ) -> list[NDArray[np.float64]]:
-    """Sort the columns of a table, which were collected step by step, into the order of the interactions."""
+    """Sort the columns of a table into the order of the interactions; the columns were collected step by step."""
     if not parts:
         return list(vars(empty).values())
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -1,13 +1,14 @@
 """Content and checksum of a path file. The shape, type and range of every dataset are checked when a file is read.
 
-The datasets are described in `docs/reference/path-file.md`.
+`docs/reference/path-file.md` describes the datasets.
 
 The seal is a checksum at the start of the file, which is verified before anything else is read. HDF5 allows a user
-block in front of the content. This block contains the SHA-256 digest of the content as one line of text. A damaged file
-can make the HDF5 library hang or crash (one hang and one crash in 3,000 files with flipped bits), so the library reads
-a file only if the checksum matches. A file from a different source may have been changed and sealed again (reading 5 of
-3,000 such files took more than a minute). Such a file is first read in a process with limited memory and time. A file
-that Calibray wrote or validated earlier for the same user is recognized by its checksum and read directly.
+block in front of the content. In a path file, the user block contains the SHA-256 digest of the content as one line of
+text. A damaged file can make the HDF5 library hang or crash (one hang and one crash in 3,000 files with flipped bits),
+so the library reads a file only if the checksum matches. A file from another source may have been changed and sealed
+again; 5 of 3,000 such files took more than a minute to read. A file from another source is therefore read first in a
+process with limited memory and time. A file that Calibray wrote or validated earlier for the same user is recognized by
+its checksum and read directly.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _SETTING: Final = "setting_"
 """Prefix of the attributes that record the settings of the trace."""
 
 _ROUNDING: Final = 1e-3
-"""Tolerance of the ranges, because numbers may have been rounded to single precision."""
+"""Tolerance on the ranges, because numbers may have been rounded to single precision."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Content:
     Attributes:
         frequency: Carrier frequency [Hz].
         settings: How the paths were traced.
-        arrays: The datasets by name; text as str.
+        arrays: The datasets by name; text is stored as str.
     """
 
     frequency: float
@@ -77,7 +78,8 @@ class Content:
 _COSINE = (-1 - _ROUNDING, 1 + _ROUNDING)
 _TO_NORMAL = (0.0, _COSINE[1])  # normals point to the side of the wave
 _ANGLE = (-2 * pi - _ROUNDING, 2 * pi + _ROUNDING)
-# Far above the values of any antenna (120 dB), scene and path, and far below values whose sum of powers overflows.
+# These limits are far above the values of any antenna (120 dB), scene or path, and far below values at which a sum of
+# powers overflows.
 _FIELD = (-1e6, 1e6)
 _LENGTH = 1e9  # [m]
 _DIVISOR = 1e-9  # a power divided by 0 is infinite
@@ -141,12 +143,14 @@ def read(file: h5py.File) -> Content:
 
     Raises:
         InputError: The format or version differs, or a dataset is missing, has the wrong shape or type, or is out of
-            range. The message does not contain the file name.
+            range. The error message does not contain the file name.
     """
     if (name := file.attrs.get("format")) != FORMAT:
-        raise InputError(f"is not a Calibray path file (attribute format = {name!r}, must be {FORMAT!r})")
+        raise InputError(f"is not a Calibray path file (attribute format = {name!r}; it must be {FORMAT!r})")
     if (version := _attribute(file, "version")) != FORMAT_VERSION:
-        raise InputError(f"has version {version} of the format, must be {FORMAT_VERSION}; trace again")
+        raise InputError(
+            f"has version {version} of the format, but must have version {FORMAT_VERSION}; trace again"
+        )
     frequency = _attribute(file, "frequency_hz")
     lower, upper = FREQUENCIES
     if isinstance(frequency, str | bool | np.bool_) or not lower <= float(frequency) <= upper:
@@ -186,7 +190,7 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
     link = file.get(name, getlink=True)
     if not isinstance(item, h5py.Dataset) or not isinstance(link, h5py.HardLink):
         raise _damaged(f"no dataset {name}")
-    # A chunked or external dataset may declare more than the file stores.
+    # A chunked or external dataset may declare more data than the file stores.
     if item.chunks is not None or item.is_virtual or item.external is not None or item.nbytes > length:
         raise _damaged(f"dataset {name} is not stored contiguously")
     if item.ndim != len(dataset.shape):
@@ -197,8 +201,8 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
         return np.array(item.asstr()[()], dtype=object)
     if item.dtype.kind not in {"i": "iu", "f": "f"}[dataset.kind]:
         raise _damaged(f"dataset {name} has the type {item.dtype}")
-    # Other programs may write other sizes and byte orders, not all of which can be combined; wedges need double
-    # precision.
+    # Other programs may write numbers of other sizes and byte orders, not all of which can be combined. Wedges need
+    # double precision.
     native = item.dtype.newbyteorder("=")
     if dataset.kind == "i":
         return item[()].astype(native if native.itemsize < 8 else np.int64, copy=False)
@@ -232,7 +236,7 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     for name, dataset in _datasets(arrays):
         expected = tuple(sizes[size] if isinstance(size, str) else size for size in dataset.shape)
         if arrays[name].shape != expected:
-            raise _damaged(f"dataset {name} has the shape {arrays[name].shape}, must be {expected}")
+            raise _damaged(f"dataset {name} has the shape {arrays[name].shape}; it must be {expected}")
 
 
 def _check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -258,7 +262,7 @@ def _check_indices(arrays: Mapping[str, NDArray[Any]]) -> None:
     if first[0] != 0 or first[-1] != len(arrays["interactions/kind"]) or (np.diff(first) < 0).any():
         raise _damaged("paths/first does not divide the interactions among the paths")
     if (np.diff(link) < 0).any():
-        raise _damaged("paths/link is not in order")
+        raise _damaged("paths/link is not in ascending order")
     indexed = {"paths/link": "links/tx_position", "interactions/material": "materials/name"}
     for name, target in indexed.items():
         index, count = arrays[name], len(arrays[target])
@@ -285,7 +289,7 @@ def seal(path: str | Path) -> None:
     try:
         with target.open("rb") as file:
             head = file.read(BLOCK)
-            # A user block, sealed or still empty, precedes the content; other programs do not write one.
+            # A user block, sealed or still empty, precedes the content. Other programs do not write a user block.
             start = BLOCK if head.startswith(PATH_SEAL) or not any(head) else 0
             file.seek(start)
             if not file.read(len(_SIGNATURE)) == _SIGNATURE:
@@ -316,8 +320,8 @@ def verify(path: Path) -> str:
     """Check that the content matches the seal, and return the checksum in hexadecimal.
 
     Raises:
-        InputError: The file is not a sealed HDF5 file, or was changed after sealing. The message does not contain the
-            file name.
+        InputError: The file is not a sealed HDF5 file, or was changed after it was sealed. The error message does not
+            contain the file name.
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
@@ -347,7 +351,7 @@ def _block(file: BinaryIO) -> bytes:
 
 
 KNOWN_BYTES: Final = 2**20
-"""Size limit of the entries of known files [bytes]. Each entry takes 32 bytes."""
+"""Limit on the total size of the entries for known files [bytes]. Each entry takes 32 bytes."""
 
 _CODE: Final = """
 from calibray.errors import InputError
@@ -374,7 +378,7 @@ def validate(file: Path, digest: str) -> None:
     """Read a path file with a matching checksum in a separate process, unless the checksum is known.
 
     Raises:
-        InputError: The file is damaged, or reading does not finish. The message does not contain the file name.
+        InputError: The file is damaged, or reading does not finish. The error message does not contain the file name.
     """
     store = _known_files()
     if digest in _known_here or (store is not None and store.trusted and store.get(digest) is not None):

@@ -1,4 +1,4 @@
-"""Kinds of interaction, and tables of additional constants of diffuse reflections and diffractions."""
+"""Kinds of interaction, and tables of additional constants for diffuse reflections and diffractions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Diffuse:
-    """Additional constants of the diffuse interactions, one row per interaction, in the same order.
+    """Additional constants of the diffuse reflections: one row per reflection, in the order of the interactions.
 
     Attributes:
         rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
@@ -45,7 +45,7 @@ class Diffuse:
 
 @dataclass(frozen=True)
 class Diffraction:
-    """Additional constants of the diffractions, one row per diffraction, in the same order.
+    """Additional constants of the diffractions: one row per diffraction, in the order of the interactions.
 
     The cosine of incidence on the 0-face is in `Paths.cos_incidence`.
 

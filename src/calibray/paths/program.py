@@ -1,9 +1,9 @@
 """The path program: traced paths in a form that allows fields to be evaluated for any materials.
 
-A path is a transmit field, a chain of interactions, and a receive field. An interaction contains the material, the
-cosine of the angle of incidence, the kind, and the real rotation from the frame of the previous interaction into the
-frame of this interaction (first axis k x n, transverse electric). The first rotation is part of the transmit field, and
-the last rotation is part of the receive field.
+A path is a transmit field, a chain of interactions, and a receive field. An interaction states its material, its kind,
+the cosine of the angle of incidence, and a real rotation from the frame of the previous interaction into its own frame.
+The first axis of each frame is k x n (transverse electric). The first rotation is part of the transmit field, and the
+last rotation is part of the receive field.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class Paths:
         cos_incidence: Cosine of the angle of incidence [I].
         rotation: (cos, sin) of the rotation from the previous frame into the frame of the interaction [I, 2].
         vertex: Points of interaction [I, 3], [m], for plots; in single precision, or in double precision far from the
-            origin. The fields do not depend on these points.
+            origin. The computed fields do not depend on the points of interaction.
         diffuse: Additional constants of the diffuse interactions.
         diffraction: Additional constants of the diffractions.
         settings: Settings of the trace, for documentation.
-        correction: Ratio of the power of each path in the engine that found it to its replayed power with the same
+        correction: Ratio of each path's power in the engine that found the path to its replayed power at the same
             constants [P]. The replayed power is multiplied by this ratio. None if there is no correction.
     """
 
@@ -124,14 +124,14 @@ class Paths:
 
         Args:
             frequency: Carrier frequency [Hz].
-            materials: Constants at this carrier, by name. Materials that are not named keep their constants.
+            materials: Constants at this carrier, by material name. Materials that are not named keep their constants.
 
         Returns:
             The program at that carrier.
 
         Raises:
-            InputError: The frequency is outside the range `calibray.materials.FREQUENCIES`, or the paths lack a
-                material.
+            InputError: The frequency is outside the range `calibray.materials.FREQUENCIES`, or a named material is not
+                a material of the paths.
         """
         return replace(self, frequency=check_frequency(frequency), materials=self._with_materials(materials))
 
@@ -161,7 +161,7 @@ class Paths:
         for name, material in (materials or {}).items():
             if not isinstance(material, Material):
                 raise InputError(
-                    f"material {name!r}: is {material!r}, must be a Material with all constants; for instance "
+                    f"material {name!r}: is {material!r}; it must be a Material with all constants, for instance "
                     f"dataclasses.replace(paths.materials[{name!r}], relative_permittivity=5.0)"
                 )
         return {**self.materials, **(materials or {})}
@@ -170,11 +170,11 @@ class Paths:
         """Write an HDF5 file (format in docs/reference/path-file.md) that h5py and MATLAB can read.
 
         Args:
-            path: File to write. An existing path file is replaced after the new file is complete.
+            path: File to write. An existing path file is replaced only once the new file is complete.
             overwrite: Whether to replace a file that Calibray did not write.
 
         Raises:
-            InputError: The folder does not exist or cannot be written, or an existing file must not be replaced.
+            InputError: The folder does not exist or cannot be written to, or an existing file must not be replaced.
         """
         target = check_file(path, overwrite=overwrite)
         try:
@@ -221,8 +221,8 @@ def read_paths(file: str | Path) -> Paths:
     """Read the path program from an HDF5 file without verifying its checksum.
 
     Raises:
-        InputError: The file is not a path file, has a different version, or is damaged. The message does not contain
-            the file name.
+        InputError: The file is not a path file, has a different version, or is damaged. The error message does not
+            contain the file name.
     """
     try:
         with h5py.File(file, "r") as stream:
@@ -240,7 +240,7 @@ _INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation", "vertex"
 
 
 def _numbers(index: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Indices [n], given as indices or as a mask."""
+    """Convert indices or a mask to indices [n]."""
     return np.flatnonzero(index) if np.asarray(index).dtype == np.bool_ else np.asarray(index, dtype=np.int64)
 
 
@@ -300,10 +300,10 @@ def concatenate(parts: Sequence[Paths]) -> Paths:
 
 
 def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
-    """Join path programs of different links. Each part has the indices of its links in the joined program.
+    """Join path programs of different links. Each part comes with the indices of its links in the joined program.
 
-    Together, the parts contain every link once. All parts have the same frequency and materials. The settings are those
-    of the first part.
+    Together, the parts contain every link once. All parts have the same frequency and materials. The joined program has
+    the settings of the first part.
     """
     num_links = sum(len(links) for links, _ in parts)
     tx, rx = np.empty((num_links, 3)), np.empty((num_links, 3))
@@ -318,8 +318,8 @@ def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
 
 
 def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int64]) -> Table:
-    """The rows of a table for the given interactions; `has_row` marks all interactions of the kind of the table [I]."""
-    # An interaction's row is the number of interactions of its kind before it.
+    """The rows of a table for the given interactions; `has_row` [I] marks the interactions that have a row."""
+    # The row of an interaction is the number of earlier interactions of the same kind.
     row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
     return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
 

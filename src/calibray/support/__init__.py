@@ -1,1 +1,1 @@
-"""Support code independent of radio: caches, output files, messages, progress and interruption."""
+"""General-purpose support code: caches, output files, messages, progress and interruption."""

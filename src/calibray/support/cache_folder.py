@@ -1,4 +1,4 @@
-"""Calibray's cache folder: data that are kept between runs and can be recomputed.
+"""Calibray's cache folder, which keeps data between runs; all of these data can be recomputed.
 
 The environment variable `CALIBRAY_CACHE` sets the folder; by default, it is `calibray` in the user's cache folder. An
 empty `CALIBRAY_CACHE` disables caching.
@@ -25,7 +25,7 @@ _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | g
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
 """Length of the SHA-256 digest at the start of each entry [bytes]."""
 _PRUNED_AT: Final = 16
-"""Average number of written entries between two checks of the total size. With 7,000 entries, a check takes 0.08 s, as
+"""Average number of writes between two checks of the total size. With 7,000 entries, a check takes 0.08 s, about as
 long as compiling a small program."""
 
 
@@ -39,16 +39,16 @@ def cache_folder() -> Path | None:
 
 @dataclass(frozen=True)
 class Store:
-    """Checksummed entries in a folder to which no other user can write, for data that must be trusted.
+    """Store of checksummed entries for data that must be trusted, in a folder that only the user can write to.
 
-    An entry is complete or absent: it is moved into place once it is fully written, and a damaged entry is removed when
-    it is read. Entries that cannot be read or written are skipped without an error.
+    An entry is either complete or absent, because it is moved into place only once it is fully written. A damaged entry
+    is removed when it is read. Entries that cannot be read or written are skipped without an error.
 
     Attributes:
         path: The folder, which need not exist.
         suffix: The file extension of the entries.
-        limit: Limit on the total size [bytes]. Above this limit, the least recently read entries are removed, during
-            about one in `_PRUNED_AT` writes.
+        limit: Limit on the total size [bytes]. Above this limit, about one in `_PRUNED_AT` writes removes the least
+            recently read entries.
     """
 
     path: Path
@@ -90,7 +90,8 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
-            # The digest of the name decides whether to check the size; about one name in `_PRUNED_AT` leads to a check.
+            # The digest of the name decides whether the size is checked; about one name in `_PRUNED_AT` triggers a
+            # check.
             if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
                 self._remove_oldest()
 
@@ -98,11 +99,11 @@ class Store:
     def _folder(self) -> Iterator[int | None]:
         """Open the folder, creating it if needed, and check who can write to it.
 
-        The check applies to the opened folder. If others can write to a parent folder, they can replace the folder at
-        this path afterwards.
+        The check applies to the opened folder. Anyone who can write to a parent folder could replace the cache folder
+        afterwards.
 
         Yields:
-            The folder's descriptor; None on Windows, where other users have no access to a user's folders.
+            The folder's file descriptor; None on Windows, where other users have no access to a user's folders.
 
         Raises:
             OSError: The folder cannot be opened, is a link, belongs to another user, or is writable by others.

@@ -1,7 +1,7 @@
-"""The common style of all figures: colours for colour-blind readers, no unnecessary lines, and units on the axes.
+"""The common style of all figures: colours suited to colour-blind readers, no unnecessary lines, and units on the axes.
 
-Most line colours are those of Okabe and Ito (2008). A figure in an HTML page takes the colours of its axes and text
-from the page, so that it is readable on light and dark backgrounds.
+Most line colours are those of Okabe and Ito (2008). A figure on an HTML page takes the colours of its axes and text
+from the page, so that the figure is readable on light and dark backgrounds.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _SETTINGS: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.size": 10,
     "text.color": INK,
-    # Names are from files, and a dollar sign in a name must not start a formula.
+    # Names come from files, and a dollar sign in a name must not start a formula.
     "text.parse_math": False,
     "axes.labelcolor": INK,
     "axes.edgecolor": FAINT,
@@ -123,7 +123,8 @@ def inline(figure: Figure, name: str) -> str:
         FigureCanvasSVG(figure).print_svg(written, metadata=nothing)
     text = written.getvalue()
     text = text[text.index("<svg") :]
-    # A style sheet in the SVG would apply to the whole page, which has the same rules; HTML needs no namespaces.
+    # A style sheet in the SVG would apply to the whole page, which already has the same rules. HTML needs no
+    # namespaces.
     text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)

@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C in compiled code, where a library can convert it to another error or drop it."""
+"""Handling of Ctrl-C in compiled code, where a library can drop the interruption or convert it into another error."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ TERMINATED: Final = 128 + signal.SIGTERM
 """Exit status after SIGTERM, which schedulers and `timeout` send."""
 
 INTERVAL: Final = 0.2
-"""Time after which a dropped interruption is raised again [s]; any value that a user does not notice would do."""
+"""Time after which a dropped interruption is raised again [s], short enough that a user does not notice the delay."""
 
 Handler = Callable[[int, FrameType | None], None]
-"""Handler of a signal: a function of its number and of the interrupted frame."""
+"""Signal handler: a function of the signal number and the interrupted frame."""
 
 
 @contextmanager
 def unwrap_interruption() -> Iterator[None]:
-    """Raise KeyboardInterrupt instead of the error to which a library converted it.
+    """Raise KeyboardInterrupt in place of the error into which a library converted it.
 
     Yields:
         Nothing; the block may call Dr.Jit or import compiled modules.
@@ -39,7 +39,8 @@ def unwrap_interruption() -> Iterator[None]:
     """
     try:
         yield
-    # In a loop, Dr.Jit raises RuntimeError; during imports, the interpreter raises SystemError, Mitsuba ImportError.
+    # Dr.Jit raises RuntimeError in a loop. During imports, the interpreter raises SystemError, and Mitsuba raises
+    # ImportError.
     except (RuntimeError, SystemError, ImportError) as error:
         cause: BaseException | None = error
         while cause is not None:
@@ -53,14 +54,14 @@ def unwrap_interruption() -> Iterator[None]:
 def ensure_interruption() -> Iterator[None]:
     """Ensure that Ctrl-C ends the block, even if a library handles or drops the interruption.
 
-    Compiled code can drop an interruption that occurs in its callbacks, or raise another error. Within this context, a
-    dropped interruption is raised again, and any error after Ctrl-C is treated as an interruption.
+    Compiled code can drop an interruption that occurs in its callbacks, or raise another error instead. Within this
+    context, a dropped interruption is raised again, and any error after Ctrl-C is treated as an interruption.
 
     Yields:
         Nothing. Outside the main thread, or if another handler for Ctrl-C is set, the block runs unchanged.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that followed, if any.
+        KeyboardInterrupt: Ctrl-C was pressed. The cause of this exception is the error that followed, if any.
         Exception: The block raised this exception, and Ctrl-C was not pressed.
     """
     with (
@@ -76,7 +77,7 @@ def ensure_interruption() -> Iterator[None]:
 
 
 def acknowledge_interruption() -> None:
-    """Stop raising the interruption again: the caller has caught it, and will raise it after saving results."""
+    """Stop raising the interruption again, because the caller has caught it and will raise it after saving results."""
     if signal.getsignal(signal.SIGALRM) is _raise_again:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
@@ -112,7 +113,7 @@ def _press(number: int, frame: FrameType | None) -> None:
 
 
 def _raise_again(_: int, frame: FrameType | None) -> None:
-    """Raise a dropped interruption again, unless it is still being handled, for example to save results."""
+    """Raise a dropped interruption again, unless it is still being handled, for example while results are saved."""
     error = sys.exception()
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
@@ -121,7 +122,7 @@ def _raise_again(_: int, frame: FrameType | None) -> None:
 
 
 def _initializes_extension(frame: FrameType | None) -> bool:
-    """Whether a compiled module is being initialized; an exception there can abort the process."""
+    """Whether a compiled module is being initialized; an exception during initialization can abort the process."""
     while frame is not None:
         if frame.f_code in (
             ExtensionFileLoader.create_module.__code__,

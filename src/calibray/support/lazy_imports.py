@@ -1,4 +1,4 @@
-"""Imports on first use: of a package's names, so that importing the package is fast, and of optional libraries."""
+"""Deferred imports of a package's names, which keep the import of the package fast, and of optional libraries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def lazy_attributes(
 ) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Make `__all__`, `__getattr__` and `__dir__` for a package (PEP 562) from the names that its modules define.
 
-    `modules` maps each module to its names, separated by spaces; an empty text means the module itself.
+    `modules` maps each module to its names, separated by spaces; an empty string stands for the module itself.
     """
     homes = {name: module for module, words in modules.items() for name in words.split() or [module]}
 
@@ -53,7 +53,7 @@ def library(name: str, extra: str) -> ModuleType:
         package = name.partition(".")[0]
         if sys.modules.get(package, package) is not None and find_spec(package) is not None:
             raise InputError(
-                f"{package} is installed but cannot be loaded ({first_line(error)}): memory is short, or its "
+                f"{package} is installed but cannot be loaded ({first_line(error)}): memory is low, or the "
                 "installation is damaged; free memory, or install it again"
             ) from None
         raise InputError(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 LEAST_ADDRESS_SPACE: Final = 2_900_000_000
-"""Smallest limit on the address space [bytes]; below it, libraries fail to load or terminate the process."""
+"""Minimum limit on the address space [bytes]; with a lower limit, libraries fail to load or terminate the process."""
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
 """Folder of the container's control group (version 2), which states the memory limit."""
@@ -35,7 +35,7 @@ def check_address_space() -> None:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
             raise InputError(
-                f"memory is short: the address space of this process is limited to {limit / 2**30:.1f} GiB (ulimit "
+                f"too little memory: the address space of this process is limited to {limit / 2**30:.1f} GiB (ulimit "
                 f"-v), and the libraries need {LEAST_ADDRESS_SPACE / 2**30:.1f} GiB; raise the limit"
             )
 
@@ -43,13 +43,14 @@ def check_address_space() -> None:
 def available_memory() -> int:
     """Memory that can be allocated before the system kills the process or refuses further allocations [bytes].
 
-    This is the smallest of the amounts left by the system, the container and the address space limit (`ulimit -v`).
+    This is the smallest of the amounts still available from the system, in the container, and under the address space
+    limit (`ulimit -v`).
     """
     import psutil  # imported here because `check_address_space` runs without it
 
     free = [psutil.virtual_memory().available]
-    # psutil ignores limits. Without a limit, memory.max contains "max". Only anonymous memory counts as used, because
-    # file caches can be freed.
+    # psutil ignores limits. If there is no limit, memory.max contains "max". Only anonymous memory counts as used,
+    # because file caches can be freed.
     with suppress(OSError, ValueError, StopIteration):
         limit = int((CONTROL_GROUP / "memory.max").read_text())
         lines = (CONTROL_GROUP / "memory.stat").read_text().splitlines()
@@ -70,7 +71,7 @@ def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The loaded BLAS libraries; cached, because finding them reads all memory maps of the process."""
+    """The loaded BLAS libraries, cached because finding them requires reading all memory maps of the process."""
     # SciPy is imported first, so that its BLAS library is among them.
     import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
@@ -115,7 +116,7 @@ def run_limited(code: str, memory: int, size: int) -> bool:
     """
     if not sys.executable:
         return True  # an embedded interpreter cannot start another interpreter
-    # Large files are read at 20 MB/s or faster.
+    # The time limit allows for large files to be read at 20 MB/s.
     limit = SECONDS + size / 20e6  # [s]
     program = _LIMITS.format(path=sys.path, memory=memory, refused=REFUSED) + code
     try:

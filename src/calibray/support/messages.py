@@ -11,9 +11,9 @@ from typing import Final
 MAX_LENGTH: Final = 80
 """Number of characters above which a value is shortened in a message."""
 MAX_LISTED: Final = 20
-"""Largest number of names or errors that a message lists."""
+"""Maximum number of names or errors that a message lists."""
 MAX_COMPARED: Final = 2_000
-"""Largest number of valid names with which an unknown name is compared."""
+"""Maximum number of valid names that an unknown name is compared with."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -49,9 +49,10 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""Escape the characters of a text that a terminal or an editor would interpret; texts can quote names from files.
+    r"""Escape all characters that a terminal or an editor would interpret, because a text can quote names from files.
 
-    Characters in `keep`, for instance line breaks, are kept; others become Python escape sequences.
+    Characters in `keep`, such as line breaks, are left unchanged; the escaped characters become Python escape
+    sequences.
 
     Example:
         >>> printable("RSS\x1b[2J\n[engine]")
@@ -89,7 +90,7 @@ def type_name(value: object) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number followed by its noun; the plural is formed with an s.
+    """A number followed by a noun, to which an s is added for the plural.
 
     Example:
         >>> counted(1, "link"), counted(1200, "link")

@@ -1,11 +1,11 @@
 """Output files, which are checked before any computation starts and are always written completely.
 
 An output never replaces an input, a link or a device. By default, it also never replaces a file that Calibray did not
-write, or that has changed since Calibray wrote it. Calibray signs its files: `.calibray` in the same folder lists the
-digest and the name of each file.
+write, or that has changed since Calibray wrote it. Calibray signs its files: the file `.calibray` in the same folder
+lists the digest and the name of each file.
 
-`replacing` writes each file under a random name in the same folder, creates it without following links, and then moves
-it into place in one step.
+`replacing` creates each file under a random name in the same folder, without following links. Once the file is
+complete, it is moved into place in one step.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def as_path(name: object, role: str) -> Path:
     """
     if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
         raise InputError(
-            f"{role}: is a {type_name(name)}, must be the name of a file or folder, as text or Path"
+            f"{role}: is a {type_name(name)}; it must be the name of a file or folder, as text or Path"
         )
     return Path(name)
 
@@ -60,7 +60,7 @@ def exists(file: str | Path) -> bool:
         return False
 
 
-# Checks before the computation; they create nothing.
+# Checks that run before the computation and create nothing.
 
 
 def check_folder(folder: str | Path) -> Path:
@@ -87,8 +87,8 @@ def check_outputs(
     did not write are replaced.
 
     Raises:
-        InputError: As for `check_folder` and `check_replaceable`; or Calibray did not write the file `.calibray` in the
-            folder.
+        InputError: A check of `check_folder` or `check_replaceable` fails, or Calibray did not write the file
+            `.calibray` in the folder.
     """
     target, sources = check_folder(folder), list(inputs)
     _check_signature_file(target)
@@ -101,7 +101,8 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
     """Refuse a file that cannot be written; the file need not exist, but its folder must. See also `check_outputs`.
 
     Raises:
-        InputError: The file is a folder; its folder does not exist or cannot be written to; or as for `check_outputs`.
+        InputError: The file is a folder, its parent folder does not exist or cannot be written to, or a check of
+            `check_outputs` fails.
     """
     target = _valid_name(file, "output file")
     if target.is_dir():
@@ -121,8 +122,8 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
     """Refuse to replace a file that must be kept; a file that does not exist is accepted.
 
     Raises:
-        InputError: The file is an input, a link, a device or a folder; or, without `overwrite`, Calibray did not write
-            the file, or the file has changed since.
+        InputError: The file is an input, a link, a device or a folder; or `overwrite` is False, and the file was not
+            written by Calibray or was changed later.
     """
     status = _status(file, "output file")
     if status is None:
@@ -195,8 +196,8 @@ def _signatures(folder: Path) -> list[str]:
 
 
 def _check_signature_file(folder: Path) -> None:
-    """Refuse a folder with a signature file that Calibray did not write, because files there could not be signed."""
-    # If it cannot be read, writing fails later with the same message as for any other file.
+    """Refuse a folder with a signature file that Calibray did not write, because files in it could not be signed."""
+    # If the signature file cannot be read, writing fails later with the same message as for any other file.
     with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
         pass
 
@@ -210,7 +211,8 @@ def _open_signatures(folder: Path, flags: int) -> BinaryIO:
         OSError: The file does not exist or cannot be opened.
     """
     path = folder / SIGNATURES
-    # Opening a FIFO or a device may block or have side effects, so the status is checked before and after.
+    # Opening a FIFO or a device may block or have side effects, so the status is checked before and after the file is
+    # opened.
     with suppress(FileNotFoundError):
         _check_signature_status(path, path.lstat())
     stream = os.fdopen(
@@ -262,7 +264,7 @@ HDF5_METADATA: Final = 2**16  # generous size of an HDF5 file without its datase
 
 
 def check_space(partial: Path, size: int) -> None:
-    """Raise an error if an HDF5 file with datasets of a given size [bytes] does not fit on its disk.
+    """Raise an error if an HDF5 file with datasets of a given size [bytes] would not fit on its disk.
 
     On a full disk, the HDF5 library prints errors that cannot be caught, and may crash the process when it exits.
 
@@ -277,8 +279,8 @@ def check_space(partial: Path, size: int) -> None:
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     """Write a file under a temporary name; once it is complete, it is signed and moved into place.
 
-    Files with their own seal need not be signed. Yields the temporary file, which is empty and in the same folder; it
-    is removed if writing fails.
+    Files with their own seal need not be signed. Yields an empty temporary file in the same folder; this file is
+    removed if writing fails.
 
     Raises:
         InputError: The file is a link, a device or a folder, Calibray did not write `.calibray`, or another program
@@ -300,7 +302,8 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
                     f"output file {path}: another program replaced {partial}; choose another folder"
                 )
         if signed:
-            # Signed first: if the process is killed between the two steps, the next run must still recognise the file.
+            # The file is signed first, so that the next run recognises it even if the process is killed between the two
+            # steps.
             _sign(partial, path)
         partial.replace(path)
     finally:
@@ -320,7 +323,7 @@ def _sign(partial: Path, path: Path) -> None:
 def _remove_unfinished(path: Path) -> None:
     """Remove the unfinished files of processes that were killed while writing this file."""
     final = path.name
-    # A scene's folder may have thousands of files, and making a Path of each takes long.
+    # A scene's folder may contain thousands of files, and making a Path for each of them takes a long time.
     with os.scandir(path.parent) as entries:
         unfinished = [
             (path.with_name(entry.name), match)
@@ -374,16 +377,18 @@ def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool =
     """Refuse a table that cannot be written (see `check_file`); the name must end in .csv or .parquet.
 
     Raises:
-        InputError: The name has another extension, or as for `check_file`.
+        InputError: The name has another extension, or a check of `check_file` fails.
     """
     target = check_file(file, inputs, overwrite)
     if target.suffix.lower() not in TABLES:
-        raise InputError(f"output file {target}: a table must end in {' or '.join(TABLES)}; rename it")
+        raise InputError(
+            f"output file {target}: the name of a table must end in {' or '.join(TABLES)}; rename the file"
+        )
     return target
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a CSV or Parquet file, without the index, and move it into place; errors are as for `growing_table`."""
+    """Write a CSV or Parquet file, without the index, and move it into place, with the errors of `growing_table`."""
     with growing_table(path) as append:
         append(table)
 
@@ -435,9 +440,10 @@ def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
     Yields a function that appends rows without their index; all tables must have the columns and types of the first.
 
     Raises:
-        InputError: As for `check_table`; pyarrow, which Parquet needs, is missing; or a column changes its type.
+        InputError: A check of `check_table` fails, the type of a column changes, or pyarrow, which Parquet needs, is
+            missing.
     """
-    # Whether the file may be replaced was checked before the computation.
+    # An earlier check, before the computation, ensured that the file may be replaced.
     target = check_table(path, overwrite=True)
     write = _csv if target.suffix.lower() == ".csv" else _parquet
     with replacing(target) as partial, write(partial, target) as append:

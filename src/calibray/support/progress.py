@@ -36,7 +36,7 @@ def with_stage(progress: Progress | None, stage: str) -> Progress | None:
 
 
 def with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
-    """Report progress with a prefix before the name of every stage, such as the method that is run.
+    """Report progress with a prefix before the name of every stage, such as the name of the method that runs.
 
     Example:
         >>> progress = with_prefix(lambda *parts: print(*parts), "SGWO-IM")
@@ -49,7 +49,7 @@ def with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
 
 
 def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Report the progress of one part as progress of the whole; `before` is the amount done in earlier parts.
+    """Report the progress of one part as progress of the whole; `before` is the amount done in all earlier parts.
 
     Example:
         >>> progress = with_total(lambda *parts: print(*parts), 100, 250)

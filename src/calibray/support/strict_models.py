@@ -1,4 +1,4 @@
-"""Strict models of file contents, which refuse unknown keys and wrong types, and their error messages."""
+"""Strict models of file contents, which refuse unknown keys and wrong types, and the error messages of these models."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "string_too_short": "must not be empty",
     "tuple_type": "must be a list",
     "too_short": "must not be empty",
-    "too_long": "must have {max_length} entries, has {actual_length}",
+    "too_long": "must have {max_length} entries, but has {actual_length}",
     "model_type": "must be a table",
     "dict_type": "must be a table",
     "dataclass_type": "must be a table",
@@ -57,10 +57,10 @@ def explain(
     source: str,
     tagged: Sequence[str] = (),
 ) -> InputError:
-    """Combine all errors in one message, with one line per error: file, dotted key, value, bound.
+    """Combine all errors in one message; each error has a line with the file, the dotted key, the value and the bound.
 
-    The message suggests valid keys for misspelled keys. `tagged` lists the tables that exist in several kinds, which
-    are distinguished by the key `name`.
+    The message suggests valid keys for misspelled keys. `tagged` lists the tables that exist in several kinds; the key
+    `name` states the kind.
     """
     lines: dict[str, str] = {}
     for fault in error.errors():
@@ -99,7 +99,7 @@ def describe_fault(fault: Mapping[str, Any]) -> str:
 
 
 def dotted(path: Sequence[str | int]) -> str:
-    """Format a key as in TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
+    """Format a key in TOML notation, for instance ``parameters."walls.thickness".bounds[1]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -111,7 +111,7 @@ def dotted(path: Sequence[str | int]) -> str:
 
 
 def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
-    """Remove the names of types from Pydantic's location; only the last key may be missing from the content."""
+    """Remove type names from Pydantic's location of an error; only the last key may be missing from the content."""
     path: list[str | int] = []
     for index, part in enumerate(location):
         last = index == len(location) - 1
@@ -128,7 +128,7 @@ def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[s
 
 
 def _shown(path: Sequence[str | int], content: Any) -> str:
-    """The value at a path as ` = VALUE`, shortened; empty for a table."""
+    """The shortened value at a path, formatted as ` = VALUE`; empty for a table."""
     for part in path:
         content = content[part]
     return "" if isinstance(content, Mapping) else f" = {shortened(repr(content))}"
