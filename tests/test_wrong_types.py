@@ -87,8 +87,8 @@ def test_columns_of_a_map_are_a_dictionary(result: cb.Result, columns: Any) -> N
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"engine": "replay"}, r"engine: is 'replay', .* study\.replace\(engine=NAME\)"),
-        ({"workers": 4}, r"workers: is 4, must be workers from engines\.open_workers"),
+        ({"engine": "replay"}, r"engine: is 'replay'; .* study\.replace\(engine=NAME\)"),
+        ({"workers": 4}, r"workers: is 4; it must be workers from engines\.open_workers"),
         ({"cheap_model": "study.toml"}, "cheap_model: is 'study.toml'; it must be a Study"),
     ],
 )
@@ -104,11 +104,11 @@ def test_workers_are_opened(study: cb.Study, result: cb.Result) -> None:
         lambda: result.coverage_map([0, 0, 12], cell=50, columns=place, workers=2),
     )
     for call in calls:
-        refused(r"workers: is 2, must be workers from engines\.open_workers", call)
+        refused(r"workers: is 2; it must be workers from engines\.open_workers", call)
     for number in ("2", 1.5, True):
-        with pytest.raises(InputError, match=r"workers: is .*, must be a whole number"):
+        with pytest.raises(InputError, match=r"workers: is .*; it must be a whole number"):
             engines.open_workers(number).__enter__()
-    with pytest.raises(InputError, match=r"scheduler: is 5, must be an address"):
+    with pytest.raises(InputError, match=r"scheduler: is 5; it must be an address"):
         engines.open_workers(scheduler=5).__enter__()
 
 
@@ -147,7 +147,7 @@ class Answers:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda loss: None, "Answers returned a NoneType from path_loss; must be a NumPy array"),
+        (lambda loss: None, "Answers returned a NoneType from path_loss; it must be a NumPy array"),
         (lambda loss: loss.tolist(), "returned a list from path_loss"),
         (lambda loss: np.vstack([loss, loss]), r"shape \(2, .*with 1 rows"),
         (lambda loss: loss[:, 1:], "returned path loss for .* links, but must return it for"),
@@ -167,7 +167,7 @@ def test_what_is_no_result(study: cb.Study, tmp_path: Path) -> None:
         lambda: cb.report(study, tmp_path / "a.html"),
     ):
         refused(r"result: is a .*Study, must be a Result; read one with Result\.load", call)
-    refused("study: is an? int, must be a Study", lambda: engines.make(5))
+    refused("study: is an? int; it must be a Study", lambda: engines.make(5))
 
 
 def test_what_is_no_study_no_links_and_no_material(study: cb.Study, paths: cb.Paths) -> None:

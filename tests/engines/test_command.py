@@ -151,7 +151,7 @@ def test_hdf5_answers_that_are_refused(tmp_path):
     ("before", "after", "message"),
     [
         ("sys.exit('license server is down')", "", r"ended with exit status 1; its output:\nlicense server"),
-        ("os.abort()", "", "ended with signal SIGABRT; it gave no output"),
+        ("os.abort()", "", "ended with signal SIGABRT; the program printed no output"),
         ("print('I forgot')", "", r"wrote no response file; its output:\nI forgot"),
         ("losses[3] = math.nan", programs.ANSWER, r"path_loss_db\[3\] = nan"),
         ("losses.pop()", programs.ANSWER, r"shape \(11,\); it must be \(12,\)"),
@@ -269,7 +269,8 @@ def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
     out = tmp_path / "out"
     with pytest.raises(
-        EngineError, match=r"the licence ran out.*the 3 calls before it also failed.*--forget-failed"
+        EngineError,
+        match=r"the licence ran out.*the run ends after 4 successive failed calls.*--forget-failed",
     ):
         calibrate(study, out=out)
     assert len(programs.calls(tmp_path)) == 12
@@ -390,7 +391,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
         (0, None, "must be at least 1"),
         (2, "tcp://here:1", "give only one of the two"),
         *(
-            (None, address, "--scheduler .*: not an address; give a host and a port, for example tcp://")
+            (None, address, "--scheduler .*: is not an address; give a host and a port, for example tcp://")
             for address in (
                 *("", "x", "127.0.0.1", "tcp://", "tcp://127.0.0.1:0", "tcp://127.0.0.1:99999", "tcp://[::1"),
                 *("tcp://127.0.0.1:abc", "http://127.0.0.1:80", "inproc://1", "ucx://a:1", "a:b:c:d"),

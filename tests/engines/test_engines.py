@@ -123,7 +123,7 @@ def test_single_precision_is_within_a_hundredth_of_a_decibel():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (np.ones(3), r"shape \(3,\), must be \(n, 3\) with n at least 1"),
+        (np.ones(3), r"shape \(3,\); it must have shape \(n, 3\) with n at least 1"),
         (np.ones((2, 2)), r"shape \(2, 2\)"),
         (np.ones((0, 3)), r"shape \(0, 3\)"),
         (np.array([[1.0, np.nan, 2.0]]), "not finite"),
@@ -156,7 +156,7 @@ def test_the_scene_is_traced_with_the_starts_unless_told_otherwise(tmp_path):
     ("value", "message"),
     [
         (np.inf, "a value is not finite"),
-        (2 + 1j, "complex128, must be real"),
+        (2 + 1j, "complex128; they must be real"),
     ],
 )
 def test_candidates_that_are_no_real_numbers_are_refused(value, message):

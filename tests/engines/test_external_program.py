@@ -194,7 +194,7 @@ def test_a_call_whose_guard_is_ended_from_outside_is_lost(tmp_path, number):
 def test_real_time_signals_have_names(tmp_path):
     number = signal.SIGRTMIN + 1
     failure = shell(tmp_path, f"kill -{int(number)} $$").run(request()).failure
-    assert failure == "ended with signal SIGRTMIN+1; it gave no output"
+    assert failure == "ended with signal SIGRTMIN+1; the program printed no output"
     assert "signal SIGKILL" in shell(tmp_path, "kill -9 $$").run(request()).failure
 
 

@@ -334,7 +334,7 @@ def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):
         assert len(ledger.table()) == 2
         engine = Recorded(Summing(), ledger, "p", "command")
         with pytest.raises(
-            InputError, match="cannot be written, and 1 candidates are not in it; make it and its"
+            InputError, match="cannot be written, and has no answer for 1 candidate; make it and its"
         ):
             engine.path_loss(CANDIDATES)
         assert engine.calls == 0

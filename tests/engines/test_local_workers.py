@@ -89,7 +89,9 @@ def test_a_chunk_that_kills_its_workers_ends_the_run(caplog, monkeypatch):
     with (
         caplog.at_level(logging.WARNING),
         engines.open_workers(1) as workers,
-        pytest.raises(EngineError, match=r"chunk 1: 2 workers died on it; give workers more memory"),
+        pytest.raises(
+            EngineError, match=r"chunk 1: 2 workers died while processing it; give workers more memory"
+        ),
     ):
         workers.ask(unchanged, [workers.keep(die, ["b"])])
     assert caplog.text.count("is being replaced") == 2

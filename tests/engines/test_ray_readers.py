@@ -105,7 +105,7 @@ def test_surfaces_that_coincide_have_the_material_that_sionna_hit() -> None:
     scene.add(rt.Receiver("rx4", [-44.0, 30.0, 1.5]))
     refracted = rt.PathSolver()(scene, max_depth=2, samples_per_src=20_000)
     rows = read_sionna_paths(refracted)
-    with pytest.raises(InputError, match="coincide there; state the material"):
+    with pytest.raises(InputError, match="coincide at this point; state the material"):
         read(rows.frame.drop(columns="hit_material"))
     assert read(refracted).num_paths > 20
     assert {"concrete", "marble"} <= set(rows.frame.hit_material.dropna())
@@ -396,7 +396,7 @@ def test_a_cell_that_is_no_list_is_refused(
 def test_paths_of_sionna_at_another_carrier_are_refused(paths: rt.Paths) -> None:
     check_carrier(paths, FREQUENCY)
     check_carrier("rays.csv", 28e9)
-    with pytest.raises(InputError, match=r"solved at 3\.5 GHz, must be at 28 GHz"):
+    with pytest.raises(InputError, match=r"solved at 3\.5 GHz, but must be solved at 28 GHz"):
         cb.read_rays(paths, SCENE, frequency=28e9)
 
 

@@ -109,7 +109,7 @@ def test_materials_are_those_of_the_faces_unless_stated(yard: Tracer, rows: pd.D
             "y": 0.0, "z": [10.0, 0, 10],
         }
     )  # fmt: skip
-    with pytest.raises(InputError, match="'stone' and 'paved' coincide there; state the material"):
+    with pytest.raises(InputError, match="'stone' and 'paved' coincide at this point; state the material"):
         cb.read_rays(reflected, scene, frequency=FREQUENCY)
     for column, value in (("material", "paved"), ("object", "b")):
         stated = cb.read_rays(reflected.assign(**{column: value}), scene, frequency=FREQUENCY)
@@ -145,7 +145,7 @@ def test_an_edge_where_two_houses_meet_has_the_stated_material(tmp_path: Path) -
             "y": 10.0, "z": [6.0, 8, 14], "power_db": -100.0,
         }
     )  # fmt: skip
-    with pytest.raises(InputError, match="'stone' and 'other' coincide there; state the material"):
+    with pytest.raises(InputError, match="'stone' and 'other' coincide at this point; state the material"):
         cb.read_rays(bent, scene, frequency=FREQUENCY)
     for column, value, expected in (("material", "stone", 0), ("material", "other", 1), ("object", "b", 1)):
         stated = cb.read_rays(bent.assign(**{column: ["", value, ""]}), scene, frequency=FREQUENCY)
@@ -220,11 +220,11 @@ WRONG = {
     ),
     "numbers that restart in every link": (
         lambda t: t.assign(path=t.path - t.groupby("link").path.transform("min")),
-        "0 is the number of several paths .*unique in the table",
+        "0 is the number of more than one path .*unique in the table",
     ),
     "no rows": (lambda t: t.iloc[:0], "contains no rows"),
-    "nothing": (lambda t: None, "is a NoneType; must be a DataFrame"),
-    "a list": (lambda t: t.path.tolist(), "is a list; must be a DataFrame"),
+    "nothing": (lambda t: None, "is a NoneType; it must be a DataFrame"),
+    "a list": (lambda t: t.path.tolist(), "is a list; it must be a DataFrame"),
     "a vertex off the surface": (lambda t: t.assign(z=t.z + 0.05 * (t.type == "reflection")), "lies 0.05 m"),
 }
 
@@ -295,12 +295,12 @@ def test_only_paths_are_written(paths: object, tmp_path: Path) -> None:
 
 
 def test_a_response_that_is_not_a_table_names_the_format(rows: pd.DataFrame, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"begins with 'path,.*must be JSON or HDF5, not CSV"):
-        parse_rays(rows.to_csv(index=False).encode(), "its response")
+    with pytest.raises(InputError, match=r"begins with 'path,.*it must be JSON or HDF5, not CSV"):
+        parse_rays(rows.to_csv(index=False).encode(), "the response")
     with h5py.File(tmp_path / "grouped.h5", "w") as content:
         content["rays/path"] = rows.path.to_numpy()
     with pytest.raises(InputError, match="must be at the root of the file; found group 'rays'"):
-        parse_rays((tmp_path / "grouped.h5").read_bytes(), "its response")
+        parse_rays((tmp_path / "grouped.h5").read_bytes(), "the response")
 
 
 def test_the_correction_takes_the_power_of_the_engine(
@@ -478,7 +478,7 @@ def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
     assert np.bincount(paths.link).tolist() == [2, 1, 2, 2, 2, 2, 2, 2]
     np.testing.assert_allclose(path_loss(paths)[2:], path_loss(traced)[2:], atol=1e-5)
     moved = rows.assign(z=rows.z + 0.5 * (rows.type == "receiver"))
-    with pytest.raises(InputError, match=r"connect positions other than those of the links.* 0\.5 m away"):
+    with pytest.raises(InputError, match=r"paths do not connect the positions of a link.* 0\.5 m away"):
         cb.read_rays(moved[moved.path % 2 == 0].assign(delay=np.nan).drop(columns="delay"), study)
 
 
@@ -609,7 +609,7 @@ def test_files_that_would_fill_the_memory_or_lie_elsewhere_are_refused(
     with h5py.File(tmp_path / "large.h5", "w") as content:
         for name in columns:
             content.create_dataset(name, (10**13,), chunks=(2**20,), dtype="f8", compression="gzip")
-    with pytest.raises(InputError, match=r"large\.h5: 457,763,672 MiB, must be at most 1024"):
+    with pytest.raises(InputError, match=r"large\.h5: has 457,763,672 MiB; it must have at most 1024"):
         read_ray_file(tmp_path / "large.h5")
     cb.write_rays(traced, tmp_path / "rays.h5")
     with h5py.File(tmp_path / "linked.h5", "w") as content:

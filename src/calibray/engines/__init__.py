@@ -2,13 +2,13 @@
 
 - `Replay` evaluates stored paths and their derivatives in microseconds to milliseconds per candidate.
 - `ReplayCarriers` does the same at several carriers.
-- `ChunkedReplay` replays chunks of links in this process or on workers. It can return sums over links instead of one
+- `ChunkedReplay` replays chunks of links in this process or on workers, and can return sums over links instead of one
   value per link.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.
 - `Command` calls an external program.
 - `Recorded` adds a `Ledger` to `Retrace` or `Command`, so that no RT call is repeated.
 
-One RT call is one run of an engine for one candidate over all links. Every engine counts its own calls. `engines.kinds`
+An RT call is one run of an engine for one candidate and all links. Every engine counts its own calls. `engines.kinds`
 defines the engine sections of a study file and is imported with the study. JAX is loaded on first use.
 """
 

@@ -6,10 +6,10 @@ weighted sum sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-ne
 greedily until the fit is accurate enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015)
 1077).
 
-Weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
-training candidates. The error is nevertheless checked at new candidates, many of which have parameters at their bounds.
-If a link's error there exceeds half the tolerance, the link is fitted again to more candidates. After several failed
-fits, it keeps all its paths.
+The weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
+training candidates. Nevertheless, the error is checked at new candidates, many of which have parameters at their
+bounds. If a link's error at the new candidates exceeds half the tolerance, the link is fitted again to more candidates.
+After several failed fits, the link keeps all its paths.
 """
 
 from __future__ import annotations
@@ -29,37 +29,40 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 TOLERANCE_DB: Final = 0.01
-"""Default tolerance for the error in a link's path loss [dB]."""
+"""Default tolerance on the error in a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
-"""A link with at most this many paths is not compressed, because the gain would be small."""
+"""A link with at most this number of paths is not compressed, because the benefit would be small."""
 
 FIT_SHARE: Final = 0.1
-"""Share of the tolerance that the fit may use; the rest allows for candidates between the training candidates."""
+"""Share of the tolerance that the fit may use; the rest is a margin for candidates between the training candidates."""
 
 CHECK_SHARE: Final = 0.5
-"""Largest accepted error at new candidates, as a share of the tolerance; the rest allows for unchecked candidates."""
+"""Maximum accepted error at new candidates, as a share of the tolerance; the rest is a margin for unchecked
+candidates."""
 
 TRAINING: Final = 16
 """The first fit uses TRAINING * (d + 1) random candidates for d parameters, in addition to corners of the bounds."""
 
 CORNER_PARAMETERS: Final = 5
-"""Largest number of parameters whose bounds define the corners; other parameters are in the middle of their range."""
+"""Maximum number of parameters whose bounds define the corners; all other parameters are in the middle of their
+ranges."""
 
 CHECKED: Final = 48
 """Number of new candidates in every check."""
 
 ROUNDS: Final = 6
-"""Largest number of fits of a link; if all fail the check, the link keeps all its paths."""
+"""Maximum number of fits of a link; if all fits fail the check, the link keeps all its paths."""
 
 RANKING: Final = 16
 """Number of candidates used to rank the paths by power."""
 
 POOL: Final = 2000
-"""Largest number of a link's strongest paths in the fit, and largest number of its other paths, chosen at random."""
+"""Maximum number of a link's strongest paths in the fit, and maximum number of its other paths, which are chosen at
+random."""
 
 BATCH_POWERS: Final = 400_000_000
-"""Largest number of powers (paths times candidates) in memory at once."""
+"""Maximum number of powers (paths times candidates) in memory at once."""
 
 FIRST_INTERVALS: Final = 512
 """Initial number of intervals in a table of coefficients."""
@@ -70,8 +73,8 @@ class Compressed:
     """A compressed program.
 
     Attributes:
-        paths: The program over the same links. The weights are included in the spreading factors of its paths. The
-            program is therefore valid only for sums of powers, not for delays or sums of fields.
+        paths: The compressed program of the same links. The weights are included in the spreading factors of its paths.
+            The compressed program is therefore valid only for sums of powers, not for delays or sums of fields.
         error_db: Largest difference in path loss between the compressed and the full program at the checked candidates
             [L], [dB].
         candidates: Number of candidates, not used in the fit, at which every compressed link was checked.
@@ -85,7 +88,8 @@ class Compressed:
 def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
     """Compress a program; the result is valid for the parameters within their bounds and for power summed over paths.
 
-    `tolerance_db` is the largest error in a link's path loss [dB]. Returns the compressed program and its error.
+    `tolerance_db` is the maximum permitted error in a link's path loss [dB]. Returns the compressed program and its
+    error.
 
     Raises:
         InputError: The tolerance is not a positive number, or a parameter's material is not in the paths.
@@ -109,7 +113,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
             in_batch = slice(ends[link] - start, ends[link + 1] - start)
             fit = _fit_link(powers, in_batch, [total[:, link] for total in totals], tolerance_db)
             if fit is not None:
-                # Paths of the link outside the pool are left out.
+                # Paths of the link that are not in the pool are left out.
                 weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
                 weight[pool[ends[link] : ends[link + 1]]], error[link] = fit
     kept = np.flatnonzero(weight > 0)
@@ -126,9 +130,9 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     """A program without the weakest paths of every link, which together carry at most `share` of the link's power.
 
-    The shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry at most this
-    share at each of these candidates. The result is valid for sums of powers. Raises InputError if a parameter's
-    material is not in the paths.
+    The power shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry at most
+    `share` of the power at each of these candidates. The returned program is valid for sums of powers. Raises
+    InputError if a parameter's material is not in the paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -136,15 +140,15 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
     _, strength, _ = _evaluate_all(paths, parameters, [candidates], FIRST_INTERVALS)
     order = np.lexsort((strength, paths.link))
     total = np.concatenate([[0.0], np.cumsum(strength[order])])
-    # Combined share of a path and all weaker paths of its link.
+    # Combined power share of a path and all weaker paths of its link.
     weaker = total[1:] - total[np.searchsorted(paths.link, paths.link[order])]
     return take(paths, np.sort(order[weaker > share]))
 
 
 def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
-    """Training candidates, including corners of the bounds, followed by the candidates of each check [n, d].
+    """Training candidates, which include corners of the bounds, followed by the candidates of each check [n, d].
 
-    A fit is least accurate where it extrapolates. In half of the candidates of a check, each parameter is therefore at
+    A fit is least accurate where it extrapolates. For half of the candidates in a check, each parameter is therefore at
     one of its bounds with a probability of one half.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
@@ -166,7 +170,7 @@ def _evaluate_all(
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
     """Evaluate the whole program.
 
-    Returns the power of every link at each set of candidates [n, L], the strength of every path [P], and the largest
+    Returns the power of every link for each set of candidates [n, L], the strength of every path [P], and the largest
     error of a tabulated coefficient. The strength of a path is its share of the link's power, summed over the ranking
     candidates.
     """
@@ -186,7 +190,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Ascending indices of the paths in the fits: the strongest and some other paths of every link with many paths."""
+    """Ascending indices of the paths in the fits: the strongest and some random paths of every link with many paths."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
@@ -198,7 +202,7 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Divide links into batches so small that the powers of their paths in the pool fit into memory."""
+    """Divide links into batches that are small enough for the powers of their paths in the pool to fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
@@ -226,10 +230,10 @@ class _Powers:
 def _fit_link(
     powers: _Powers, paths: slice, totals: list[NDArray[np.float64]], tolerance_db: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Weights of a link's paths in the pool, and the largest error at new candidates; None if no fit is accurate.
+    """Weights of a link's paths in the pool, and largest error at new candidates; None if no fit is accurate enough.
 
-    Candidates at which the link has no power, for instance because nothing scatters, are omitted: weights cannot change
-    a power of zero.
+    Candidates at which the link has no power, for instance because nothing scatters, are omitted, because weights
+    cannot change a power of zero.
     """
     # Largest relative error of a power, converted from decibels.
     bound = FIT_SHARE * tolerance_db * np.log(10) / 10
@@ -238,7 +242,7 @@ def _fit_link(
         positive = total > 0
         share = powers.at(index, paths)[positive] / total[positive, None]
         if index:
-            # The first set is only for training; each further set checks the fit to all earlier sets.
+            # The first set serves only for training; each further set checks the fit to all earlier sets.
             weight = sparse_weights(np.vstack(shares), bound, first)
             first = np.flatnonzero(weight)
             error = float(np.abs(10 * np.log10(share @ weight)).max(initial=0.0))
@@ -254,7 +258,7 @@ def sparse_weights(
 ) -> NDArray[np.float64]:
     """Sparse weights w >= 0 [P] with sum_p w_p share_p = 1 in every row of `share` [n, P].
 
-    The residual of every row is within `bound` if non-negative weights can achieve this. The search starts with the
+    The residual of every row is within `bound` if non-negative weights can achieve this. The search starts from the
     paths `first`.
     """
     norm = np.linalg.norm(share, axis=0)

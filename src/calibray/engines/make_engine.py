@@ -1,4 +1,4 @@
-"""Make the engine of a study, and a fingerprint of everything, except the candidate, that determines its answers."""
+"""Make the engine of a study, and a fingerprint of everything that determines its answers, except the candidate."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def make(
         study: The study, opened or not.
         name: "replay", "retrace" or "command"; if None, the study's engine.
         progress: Called after every launch of a trace ("tracing") or after every RT call of a batch ("running").
-        ledger: SQLite file that stores RT calls. Replay does not use it, because replaying is faster than reading the
-            file.
+        ledger: SQLite file that stores RT calls. Replay does not use the ledger, because replaying is faster than
+            reading the file.
         workers: Workers that run the calls of a batch ("command") or hold chunks of links ("replay").
         paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
 
@@ -49,13 +49,13 @@ def make(
         The engine, for all links of the study, including held-out links.
 
     Raises:
-        InputError: The engine is unknown, does not suit the study, or does not support workers; the ledger cannot be
-            used; or the study's scene, links or parameters cannot be used.
+        InputError: The engine is unknown, is unsuitable for the study, or does not support workers; or the ledger, or
+            the study's scene, links or parameters, cannot be used.
     """
     check_workers(workers)
     if not hasattr(study, "opened"):
         raise InputError(
-            f"study: is a {type_name(study)}, must be a Study; read a file with Study.load(file)"
+            f"study: is a {type_name(study)}; it must be a Study; read a file with Study.load(file)"
         )
     opened = study.opened()
     name = opened.engine.name if name is None else name
@@ -63,14 +63,14 @@ def make(
         raise InputError(f"engine {name!r}: must be one of {', '.join(KINDS)}")
     if workers is not None and not (KINDS[name].external or KINDS[name].chunked):
         raise InputError(
-            f"engine {name!r} runs in this process; --workers and --scheduler need the engine 'command' or 'replay'"
+            f"engine {name!r} runs in this process; --workers and --scheduler require the engine 'command' or 'replay'"
         )
     if name != opened.engine.name:
         opened = opened.replace(engine=name)
     engine = opened.engine.open(opened, paths, progress, workers)
     if ledger is None or not opened.engine.expensive:
         return engine
-    # Every expensive kind returns its answers one by one.
+    # Every expensive kind of engine returns its answers one by one.
     files = opened.engine.program_files(opened)
     return Recorded(cast(Answering, engine), Ledger(ledger), fingerprint(opened), name, progress, files)
 
@@ -78,9 +78,9 @@ def make(
 def fingerprint(study: OpenedStudy) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
-    The method, seed, measured values, bounds and start values are excluded, so studies that differ only in these share
-    stored calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is
-    unknown, so its command line is included instead.
+    The method, seed, measured values, bounds and start values are excluded, so studies that differ only in these
+    respects share stored calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's
+    version is unknown, so its command line is included instead.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
     # Calibrated constants are part of the candidate.
@@ -121,7 +121,7 @@ def fingerprint(study: OpenedStudy) -> str:
 
 
 def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[str, object]]:
-    """The constants of every material that are not calibrated, by name."""
+    """For every material by name, the constants that are not calibrated."""
     return {
         name: {
             constant: value
@@ -133,7 +133,7 @@ def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[
 
 
 def _geometry(scene: Scene) -> bytes:
-    """The scene's XML without material constants, some of which are calibrated and belong to the candidate."""
+    """The scene's XML without material constants, because calibrated constants belong to the candidate."""
     root = ElementTree.fromstring(scene.xml)
     for constants in root.findall("bsdf"):
         root.remove(constants)

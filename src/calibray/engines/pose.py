@@ -1,4 +1,4 @@
-"""Errors in the stated directions and gains of transmit antennas, as an effect on stored paths."""
+"""Errors in the stated directions and gains of transmit antennas, modelled as an effect on stored paths."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ class PoseError:
         weights: Changes in the yaw [rad], downtilt [rad] and gain [dB] of every transmitter per unit of each of e
             effect parameters [3, T, e].
         antennas: The distinct antennas.
-        gains: Content of the antennas as text. It causes a new compilation if a gain file changes but keeps its name.
+        gains: Content of the antennas as text, which triggers a new compilation if a gain file changes but keeps its
+            name.
     """
 
     basis: Any
@@ -127,7 +128,7 @@ def pose_error(
     """
     names, transmitter = np.unique(labels, return_inverse=True)
     degree = np.pi / 180
-    # Compass bearings increase clockwise, yaw counter-clockwise.
+    # Compass bearings increase clockwise, but yaw increases counter-clockwise.
     unit = {"azimuth": -degree if from_north else degree, "downtilt": degree, "gain": 1.0}
     weights = np.zeros((len(FIELDS), len(names), len(effect_parameters)))
     for number, parameter in enumerate(effect_parameters):

@@ -12,10 +12,10 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Largest accepted difference between two readings of a process's start time [s].
+"""Maximum accepted difference between two readings of a process's start time [s].
 
 A start time since 1970 changes if the system clock is corrected between the readings. The system does not reuse a
-process number within this time, because it first uses all other numbers.
+process number within this time, because all other numbers are used first.
 """
 
 
@@ -27,9 +27,9 @@ class ProcessOwner:
         host: The machine.
         namespace: The process namespace, in which a container numbers its own processes; empty if unknown.
         pid: The process number.
-        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown]; it is needed because
+        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown], which is needed because
             process numbers are reused.
-        boot: Boot identifier; it is needed because the same numbers refer to other processes after a reboot. Empty if
+        boot: Boot identifier, which is needed because process numbers refer to other processes after a reboot; empty if
             unknown.
     """
 
@@ -88,10 +88,10 @@ class ProcessOwner:
 
 
 def _start_time(pid: int) -> float:
-    """Start time of a process [s]. On Linux it is measured from boot, so it does not depend on the system clock.
+    """Start time of a process [s]. On Linux, the time is measured from boot, so it does not depend on the system clock.
 
     Raises:
-        FileNotFoundError: The process does not exist. The error can also be `ProcessLookupError` or
+        FileNotFoundError: The process does not exist. The error can also be a `ProcessLookupError` or a
             `psutil.NoSuchProcess`.
     """
     if not _boot():

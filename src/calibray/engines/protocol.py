@@ -52,7 +52,7 @@ class Differentiable(Engine, Protocol):
 
     @property
     def large(self) -> bool:
-        """Whether evaluating a candidate takes milliseconds rather than microseconds."""
+        """Whether the evaluation of a candidate takes milliseconds rather than microseconds."""
         ...
 
     @property
@@ -79,8 +79,8 @@ class Responses:
         path_loss: Path loss [n, L], [dB]; +inf for a link without a path.
         observed: K further observables [n, K, L], in SI units; NaN for a link without a value.
         loss_slope: Derivatives of path loss with respect to the parameters [n, L, d]; None if not requested.
-        observed_slope: Derivatives of the further observables [n, K, L, d]; None if not requested. They are NaN for a
-            link without a value.
+        observed_slope: Derivatives of the further observables [n, K, L, d]; None if not requested. These derivatives
+            are NaN for a link without a value.
     """
 
     path_loss: NDArray[np.float64]
@@ -103,7 +103,7 @@ def joined(parts: Sequence[Responses]) -> Responses:
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
     """Combine the responses of subsets of the links; `links` contains the indices [l] of each subset's links."""
     count, arrays = sum(map(len, links)), []
-    # Axis of the links in path loss, in observables, and in the derivatives of both.
+    # Axis of the links in path loss, in observables, and in the derivatives of both quantities.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
         shape = list(column[0].shape)
         shape[axis] = count
@@ -133,12 +133,12 @@ Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
 """Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
 
 Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
-"""Maps candidates [n, d] and a flag that requests derivatives to the results of all chunks' reductions."""
+"""Maps candidates [n, d] and a flag that requests derivatives to the results of the reductions of all chunks."""
 
 
 @runtime_checkable
 class Chunked(Differentiable, Protocol):
-    """An engine whose links are split into chunks, which can be on other machines."""
+    """An engine whose links are divided into chunks, which can be on other machines."""
 
     @property
     def chunks(self) -> Sequence[NDArray[np.int64]]:
@@ -146,7 +146,7 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """Make a function of candidates that reduces each chunk's path loss on its worker, so that little data is sent.
+        """Make a function of candidates that reduces each chunk's path loss on a worker, so that little data is sent.
 
         Every chunk has one reduction, which is sent to its worker once.
         """
@@ -164,13 +164,13 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
-        """The same engine on paths traced with other materials; `progress` is called after every chunk."""
+        """The same engine with paths traced with other materials; `progress` is called after every chunk."""
         ...
 
 
 @runtime_checkable
 class ReplaysScene(Protocol):
-    """An engine on stored paths that can leave out effects, which an exported scene does not contain."""
+    """An engine with stored paths that can leave out effects, because an exported scene does not contain effects."""
 
     def scene_path_loss(
         self, candidates: NDArray[np.float64], walls: Mapping[str, str]
@@ -192,8 +192,8 @@ class Answer:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
         seconds: Duration of the call [s].
         failure: Error message that names the engine and the candidate; empty if the call succeeded.
-        rays: The unchanged response of a program that returns rays, or further observables [K, L] in SI units as
-            little-endian doubles; empty if there are neither rays nor observables.
+        rays: The unchanged response of a program that returns rays, or else further observables [K, L] in SI units as
+            little-endian doubles; empty if there are neither.
         lost: Whether the call failed because its worker or guard ended, which is not the program's fault. The ledger
             does not store such a failure.
     """
@@ -223,7 +223,7 @@ class Answering(Engine, Protocol):
         """Yield the answer to each of the candidates [n, d], in the parameters' units, as soon as its call ends.
 
         After another thread sets `stop`, no further call starts, and running calls are stopped if possible. Answers
-        that have already arrived are still returned.
+        that have already arrived are still yielded.
 
         Raises:
             InputError: A value is unphysical.
@@ -236,7 +236,7 @@ class Answering(Engine, Protocol):
 def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
     """Collect the path loss [n, L], [dB], of a batch of answers; +inf for all links of a failed candidate.
 
-    If the whole first batch fails, the fault is assumed to be in the engine.
+    If the whole first batch fails, the engine is assumed to be at fault.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -276,12 +276,14 @@ def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.
     """
     values = np.asarray(candidates)
     if values.dtype.kind not in "fiu":
-        raise InputError(f"candidates: values of type {values.dtype}, must be real numbers")
+        raise InputError(f"candidates: values are of type {values.dtype}; they must be real numbers")
     if values.ndim != 2 or values.shape[1] != width or not len(values):
-        raise InputError(f"candidates: shape {values.shape}, must be (n, {width}) with n at least 1")
+        raise InputError(
+            f"candidates: the array has shape {values.shape}; it must have shape (n, {width}) with n at least 1"
+        )
     values = values.astype(float, copy=False)
     if not np.isfinite(values).all():
-        raise InputError("candidates: a value is not finite; give numbers within the bounds")
+        raise InputError("candidates: a value is not finite; give finite numbers within the bounds")
     return values
 
 
@@ -318,7 +320,7 @@ def _path_loss(engine: Engine, candidates: NDArray[np.float64]) -> NDArray[np.fl
     if not isinstance(loss, np.ndarray) or loss.ndim != 2 or len(loss) != count or loss.dtype.kind != "f":
         shape = f" of shape {loss.shape} and type {loss.dtype}" if isinstance(loss, np.ndarray) else ""
         raise EngineError(
-            f"the engine {type(engine).__name__} returned a {type(loss).__name__}{shape} from path_loss; must be a "
+            f"the engine {type(engine).__name__} returned a {type(loss).__name__}{shape} from path_loss; it must be a "
             f"NumPy array of floats with {count} rows, one per candidate, and one column per link"
         )
     if not (loss > -np.inf).all():

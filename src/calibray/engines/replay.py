@@ -1,4 +1,4 @@
-"""Replay evaluates stored paths and their derivatives for any candidate, with one program per carrier."""
+"""Replay: evaluates stored paths and their derivatives for any candidate, with one program per carrier."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 MOST_DERIVATIVES: Final = 2_000_000
-"""Largest number of derivatives with respect to material constants in one call, to limit memory use."""
+"""Maximum number of derivatives with respect to material constants in one call, which limits memory use."""
 
 MAY_TABULATE: Final = 30_000
-"""Number of interactions above which coefficients can be taken from tables."""
+"""Number of interactions above which coefficients can be read from tables."""
 
 MOST_NODES: Final = 0.25
-"""Largest number of table nodes per interaction; filling more nodes takes longer than the tables save."""
+"""Maximum number of table nodes per interaction; filling more nodes takes longer than the time that the tables save."""
 
 TABLE_TOLERANCE: Final = 1e-4
-"""Largest error of a tabulated coefficient."""
+"""Maximum permitted error of a tabulated coefficient."""
 
 TABLE_CANDIDATES: Final = 32
-"""Number of candidates spread over the bounds; these and the start values determine the resolution of the tables."""
+"""Number of candidates spread over the bounds, which together with the start values determine the resolution of the
+tables."""
 
 BATCH: Final = 32
-"""Largest number of candidates in one call."""
+"""Maximum number of candidates in one call."""
 
 OBSERVED_SIZE: Final = 64
-"""Largest number of candidates in one call for further observables; the function is compiled for this number."""
+"""Maximum number of candidates in one call for further observables; the function is compiled for this number."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class Computation:
     Attributes:
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
             are combined by power, and double precision otherwise.
-        tabulate: Whether coefficients are taken from tables; if None, tables are used when they are faster.
-        batch: Largest number of candidates in one call; the program is compiled for this number.
+        tabulate: Whether coefficients are read from tables; if None, tables are used if they are faster.
+        batch: Maximum number of candidates in one call; the program is compiled for this number.
     """
 
     dtype: type | None = None
@@ -65,7 +66,7 @@ class Replay:
         parameters: The parameters whose values a candidate contains.
         combining: How a link's paths are combined: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        effects: Effects on the paths, in the order of `paths`.
+        effects: Effects on the paths, with paths in the order of `paths`.
         computation: Precision, tables and batch size.
 
     Raises:
@@ -90,7 +91,7 @@ class Replay:
         self._dtype, self._batch = dtype, computation.batch
         self._combining = fields.Combining.make(combining, paths.link, paths.delay, bandwidth)
         # Row (material) and column (constant) of each parameter in the table of constants. Derivatives are computed for
-        # the columns that occur, and then assigned to parameters.
+        # the columns in use, and then assigned to parameters.
         self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
         used_columns, self._used_column = np.unique(self._columns, return_inverse=True)
         self._used_columns = tuple(int(column) for column in used_columns)
@@ -108,7 +109,7 @@ class Replay:
 
     @property
     def parts(self) -> tuple[tuple[Replay, NDArray[np.intp]], ...]:
-        """The replay of every carrier with the indices of its links; here, this replay with all links."""
+        """The replay of every carrier with the indices of its links; in this class, this replay with all links."""
         return ((self, np.arange(self.paths.num_links)),)
 
     @property
@@ -123,7 +124,7 @@ class Replay:
         if not self.effects and not walls:
             return self.path_loss(candidates)
         names = list(self.paths.materials)
-        # Facades get the material of the wall that they are part of.
+        # Each facade takes the material of the wall that it is part of.
         whole = np.array([names.index(walls.get(name, name)) for name in names], self.paths.material.dtype)
         paths = replace(self.paths, material=whole[self.paths.material])
         return Replay(paths, self.parameters, *self._options).path_loss(candidates)
@@ -155,7 +156,8 @@ class Replay:
         if self._combining.kind == "power":
             self.calls += len(values)
             return responses
-        # Other ways of combining need more than path powers. The methods below count the candidates themselves.
+        # Other ways of combining paths need more than path powers. The methods called below count the candidates
+        # themselves.
         if not derivatives:
             return replace(responses, path_loss=self.path_loss(candidates))
         loss, slope = self.path_loss_and_jacobian(candidates)
@@ -190,7 +192,7 @@ class Replay:
     def _by_parameter(
         self, by_material: NDArray[np.floating], by_effect: NDArray[np.floating]
     ) -> NDArray[np.floating]:
-        """Derivatives with respect to parameters [..., d] from those with respect to material constants and effects."""
+        """Derivatives by parameter [..., d], from derivatives with respect to material constants and effects."""
         jacobian = np.empty((*by_effect.shape[:-1], len(self.parameters)), by_effect.dtype)
         jacobian[..., self.parameters.of_materials] = by_material[..., self._rows, self._used_column]
         jacobian[..., self.parameters.of_effects] = by_effect
@@ -230,8 +232,8 @@ class Replay:
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             too_coarse = table_error > TABLE_TOLERANCE
             refused = np.flatnonzero(too_coarse.any(axis=(1, 2)))
-            # Candidates before the first refused one are accurate; evaluation resumes at the refused one with finer
-            # tables.
+            # Candidates before the first refused candidate are accurate; evaluation resumes at this candidate with
+            # finer tables.
             done = refused[0] if len(refused) else len(batch)
             batches.append([np.asarray(answer[:done], dtype=float) for answer in answers])
             start += done
@@ -245,11 +247,11 @@ class Replay:
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Material constants [size, M, 8] and effect parameters [size, e] of a batch.
 
-        The program is compiled for `size` candidates; unused rows of the tables have the base values.
+        The program is compiled for `size` candidates; unused rows of the tables contain the base values.
         """
         tables = np.repeat(base[None], size, axis=0)
         tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
-        # Unused rows of effect parameters repeat values of the batch; answers for unused rows are dropped.
+        # Unused rows of effect parameters repeat values of the batch; answers for unused rows are discarded.
         of_effects = np.resize(batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects)))
         return tables, of_effects
 
@@ -266,7 +268,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
-        """Refine the tables marked in a mask [M, 3]; if one would exceed `FINEST` intervals, stop using tables."""
+        """Refine the tables marked in a mask [M, 3]; if a table would exceed `FINEST` intervals, stop using tables."""
         if self._intervals is not None:
             finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -301,7 +303,7 @@ class CarrierPaths:
 
 @final
 class ReplayCarriers:
-    """Stored paths, evaluated at several carriers; parameters can be coefficients of frequency laws.
+    """Stored paths that are evaluated at several carriers; parameters can be coefficients of frequency laws.
 
     Args:
         carriers: The paths at each carrier; every link belongs to exactly one carrier.
@@ -324,8 +326,8 @@ class ReplayCarriers:
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(materials), 0
         self.num_links = sum(len(carrier.links) for carrier in carriers)
-        # Two coefficients of one law act on the same constant. Each carrier therefore replays only distinct constants,
-        # and `_constant` maps every parameter to its constant. The mapping is the same at all carriers.
+        # Two coefficients of one frequency law act on the same constant. Each carrier therefore replays only distinct
+        # constants, and `_constant` maps every parameter to its constant. The mapping is the same at all carriers.
         constants = [parameters.at_carrier(carrier.paths.frequency) for carrier in carriers]
         self._constant = constants[0][1]
         self._first = np.unique(self._constant, return_index=True)[1]

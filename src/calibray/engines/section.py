@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RadioSettings:
-    """Radio settings that all links of a study share.
+    """Radio settings shared by all links of a study.
 
     Attributes:
-        frequency: Carrier frequency [Hz] of links that state none.
+        frequency: Carrier frequency [Hz] of links that state no carrier.
         bandwidth: Bandwidth [Hz], or None.
         combining: How a link's paths are combined: "power", "coherent" or "band".
         antennas: Transmit and receive antennas.
@@ -48,7 +48,7 @@ class RadioSettings:
 
 
 class OpenedStudy(Protocol):
-    """A study whose files have been read, with everything that engines require; `calibray.Setup` implements it."""
+    """A study whose files have been read, with all that engines require; `calibray.Setup` implements this class."""
 
     @property
     def links(self) -> Measurements:
@@ -120,7 +120,7 @@ class OpenedStudy(Protocol):
         ...
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects other than materials on the paths of the given links, or of all links if None."""
+        """Effects other than materials on the paths of the given links; all links if None."""
         ...
 
     def at(self, links: Measurements) -> Self:
@@ -143,12 +143,12 @@ class Openable(Protocol):
 class EngineSection(Section, ABC):
     """``[engine]``: the engine that computes the path loss of candidates; `name` states its kind.
 
-    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`, where it is found
+    To add a kind of engine, write one final subclass in a separate module in `engines.kinds`; the subclass is found
     automatically. The fields of the class are the keys of the section in the study file, and `name` is a literal. Put
-    heavy imports into `open`, because reading any study file imports all kinds.
+    heavy imports into `open`, because reading any study file imports all kinds of engines.
 
     Attributes:
-        name: The kind's name in study files.
+        name: The name of the kind in study files.
         expensive: Whether a call takes longer than reading a stored answer; a ledger then stores the calls.
         external: Whether an external program computes the answers and no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
@@ -166,10 +166,10 @@ class EngineSection(Section, ABC):
 
     @abstractmethod
     def answers_by(self, study: OpenedStudy) -> list[str] | None:
-        """Versions or a command line that determine the answers; None if answers are not stored in a ledger."""
+        """The versions or the command line that determine the answers; None if answers are not stored in a ledger."""
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
-        """SHA-256 of the program's files in the study's folder, by their names on the command line."""
+        """SHA-256 of the program's files in the study's folder, by the names on the command line."""
         return {}
 
     @abstractmethod

@@ -128,7 +128,7 @@ class Store:
         ages = []
         with suppress(OSError):
             for path in self.path.glob(f"*{self.suffix}"):
-                with suppress(OSError):  # another process may remove it in the meantime
+                with suppress(OSError):  # another process may remove the file in the meantime
                     status = path.lstat()
                     if stat.S_ISREG(status.st_mode):
                         ages.append((status.st_mtime, path))

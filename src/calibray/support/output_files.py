@@ -29,7 +29,7 @@ from calibray.support.messages import shortened, type_name
 
 PARTIAL: Final = ".part"  # suffix of unfinished files
 SIGNATURES: Final = ".calibray"  # one line per written file: SHA-256 and name; lines are only appended
-SIGNATURES_LIMIT: Final = 2**26  # size limit of a signature file [bytes]; a line takes about 80
+SIGNATURES_LIMIT: Final = 2**26  # maximum size of a signature file [bytes]; a line takes about 80 bytes
 PATH_SEAL: Final = b"calibray/paths sha256 "  # start of a path file
 STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its process has ended
 

@@ -1,1 +1,1 @@
-"""Chunks of links, and the processes and machines that process them."""
+"""Chunks of links, and the processes and machines that process the chunks."""

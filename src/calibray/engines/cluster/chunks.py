@@ -1,8 +1,8 @@
-"""Division of links into chunks, work done once per chunk on the workers (tracing, prediction), and chunked replay.
+"""Division of links into chunks, work done once per chunk on a worker (tracing, prediction), and chunked replay.
 
 The division, and thus every result, depends only on the links and the study, never on the workers. Chunks traced by one
 command can therefore be read from the cache by a later command. For replay, each chunk is traced and compiled on one
-worker, and stays there. Candidates are sent to the workers, which return the path loss of their chunks. With
+worker, which keeps the chunk. Candidates are sent to the workers, which return the path loss of their chunks. With
 `reducing`, the workers return only a few sums, regardless of the number of links.
 """
 
@@ -45,24 +45,25 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Default limit on links per chunk; it is raised if there would otherwise be more than `MOST_CHUNKS` chunks."""
+"""Default maximum number of links per chunk, which is raised if there would otherwise be more than `MOST_CHUNKS`
+chunks."""
 
 MOST_CHUNKS: Final = 64
-"""Largest number of chunks if the study does not state their size. The number is limited because every chunk compiles
+"""Maximum number of chunks if the study does not state a chunk size. The number is limited because every chunk compiles
 its own program.
 """
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 
 _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
-"""Reference to the content that was unpacked last; between two chunks, there might be no other reference to it."""
+"""Reference to the content that was unpacked last, which keeps the content in memory between two chunks."""
 
 
 @final
 class Shared(Generic[Content]):
     """Content that all chunks share, for instance an opened study; each process unpacks it once.
 
-    A shared study needs to contain only one or a few links, because each chunk has its own links.
+    A shared study needs to contain only a few links, because each chunk has its own links.
     """
 
     def __init__(self, content: Content) -> None:
@@ -124,12 +125,12 @@ def _do_task(task: _Task[Any, Any]) -> Any:
 
 
 def identity(value: Content) -> Content:
-    """Return the argument; used for objects that are already the answer of a chunk, or that are sent unchanged."""
+    """Return the argument; used if an object is already the answer of a chunk, or if an object is sent unchanged."""
     return value
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """Make a function that, called with a finished chunk's number, reports the links done so far as "tracing"."""
+    """Make a function that receives the number of a finished chunk and reports the links done so far as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:
@@ -142,7 +143,7 @@ def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) 
 
 
 def chunk_size(stated: int | None, count: int) -> int:
-    """Largest number of links per chunk, given the number stated in the study and the total number of links."""
+    """Maximum number of links per chunk, given the number stated in the study and the total number of links."""
     return stated or max(CHUNK_LINKS, -(-count // MOST_CHUNKS))
 
 
@@ -152,7 +153,7 @@ def stated_chunk_size(study: OpenedStudy) -> int | None:
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Divide links into chunks of at most `size` links, nearly equal in size, whose rays start at few positions.
+    """Divide links into chunks of similar size, with at most `size` links each, whose rays start at few positions.
 
     Returns the indices of every chunk's links, in ascending order.
 
@@ -197,7 +198,8 @@ def trace_in_chunks(
     one_link = study.at(select_links(links, np.array([0])))
     answers = for_each_chunk(workers, partial(_trace_chunk, check), one_link, links, size, progress)
     paths = join_links([(chunk, chunk_paths) for chunk, (chunk_paths, _) in answers])
-    # If rays are added in rounds, the settings state their number and the last change; the largest values are kept.
+    # If rays are added in rounds, the settings state the number of rays and the last change; the largest values are
+    # kept.
     worst = {
         name: max(cast(float, chunk_paths.settings[name]) for _, (chunk_paths, _) in answers)
         for name in ("rays", "last_round_db")
@@ -231,7 +233,7 @@ _TRACING: Final = Lock()
 
 @dataclass(frozen=True, eq=False)
 class ChunkRecipe:
-    """Everything that is needed to make a chunk.
+    """All data needed to make a chunk.
 
     Attributes:
         shared: The opened study.
@@ -263,7 +265,7 @@ class Chunk:
             self.engine = recipe.open(self.study, recipe.materials)
 
     def derived(self, make: Callable[[Chunk], Content]) -> Content:
-        """The result of `make` for this chunk; it is kept until the method is called with another function."""
+        """The result of `make` for this chunk, which is kept until the method is called with another function."""
         if self._derived is None or self._derived[0] != make:
             self._derived = None  # frees the memory first
             self._derived = make, make(self)
@@ -279,7 +281,7 @@ Derive = Callable[[Chunk], Differentiable]
 
 @final
 class ChunkedReplay:
-    """Replays links in chunks on workers, for any candidate; the constructor opens all chunks.
+    """Replays links for any candidate, in chunks on workers; the constructor opens all chunks.
 
     Args:
         workers: Workers that keep the chunks.
@@ -374,7 +376,7 @@ class ChunkedReplay:
     def traced_with(
         self, materials: Mapping[str, Material], progress: Progress | None = None
     ) -> ChunkedReplay:
-        """A replay of the same links on paths traced with other materials; see `Chunked.traced_with`."""
+        """A replay of the same links with paths traced with other materials; see `Chunked.traced_with`."""
         return ChunkedReplay(self._workers, self._study, self.chunks, self._open, materials, progress)
 
     def derived(self, parameters: Parameters, derive: Derive) -> ChunkedReplay:

@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 SCHEDULER_WAIT = 30.0
-"""Longest wait for an answer from a scheduler [s]."""
+"""Maximum time to wait for an answer from a scheduler [s]."""
 
 POLL: Final = 0.5
 """Interval between checks for dead workers [s]."""
 
 REPLACEMENT_WAIT: Final = 10.0
-"""Longest wait for the replacement of a dead worker before other workers get its chunks [s]."""
+"""Maximum time to wait for the replacement of a dead worker before other workers receive its chunks [s]."""
 
 NO_WORKER_WAIT: Final = 600.0
-"""Longest wait for a worker if none is left [s]."""
+"""Maximum time to wait for a new worker if no worker is left [s]."""
 
 MOST_DEATHS: Final = 4
-"""Number of worker deaths on one chunk after which the run ends; the chunk is then probably too large."""
+"""Number of worker deaths on one chunk after which the run ends, because the chunk is probably too large."""
 
 FETCH_WAIT: Final = POLL
-"""Initial wait for the transfer of a finished answer [s]. The wait doubles with every request, so that large answers
-arrive eventually. Dead workers are detected between requests.
+"""Initial time to wait for the transfer of a finished answer [s]. This time doubles with every request, so that large
+answers eventually arrive. Dead workers are detected between requests.
 """
 
 Answered = Callable[[int], None]
@@ -46,7 +46,7 @@ Answered = Callable[[int], None]
 
 
 def count_death(deaths: Counter[int], chunk: int) -> None:
-    """Count the death of a worker that was processing a chunk.
+    """Count the death of a worker that died while processing a chunk.
 
     Raises:
         EngineError: Too many workers died on this chunk.
@@ -54,7 +54,7 @@ def count_death(deaths: Counter[int], chunk: int) -> None:
     deaths[chunk] += 1
     if deaths[chunk] >= MOST_DEATHS:
         raise EngineError(
-            f"chunk {chunk + 1}: {MOST_DEATHS} workers died on it; give workers more memory, or lower "
+            f"chunk {chunk + 1}: {MOST_DEATHS} workers died while processing it; give workers more memory, or lower "
             "engine.chunk_links"
         )
 
@@ -67,7 +67,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class _KeptRemotely:
-    """Objects on workers: for each chunk, the worker that last made its object, and Dask's reference to that object."""
+    """Objects on workers: for each chunk, the worker that last made the object, and Dask's reference to the object."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -79,11 +79,11 @@ class _KeptRemotely:
 
 @final
 class DaskWorkers:
-    """The workers of a Dask cluster, opened on first use.
+    """The workers of a Dask cluster, to which this process connects on first use.
 
     A chunk stays on one worker, its home. If that worker dies, its replacement or another worker receives the chunk and
     makes its objects again. The paths are then read from the cache if all workers share the cache folder. `connect`
-    returns Dask's client, and `open_executor` an executor for the calls of an external program.
+    returns Dask's client, and `open_executor` returns an executor for the calls of an external program.
     """
 
     def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:
@@ -156,7 +156,7 @@ class DaskWorkers:
             return
 
     def _fetch(self, future: Future, index: int, answers: dict[int, Any], patience: float) -> bool:
-        """Fetch an answer; return False if it was lost with its worker or if its transfer exceeds `patience` [s]."""
+        """Fetch an answer; return False if its worker died or if the transfer takes longer than `patience` [s]."""
         from distributed import KilledWorker
 
         try:
@@ -172,13 +172,15 @@ class DaskWorkers:
         """Assign the chunks of dead workers to other workers.
 
         Raises:
-            EngineError: Too many workers died on one chunk, or no worker is left.
+            EngineError: Too many workers died while processing one chunk, or no worker is left.
         """
         living = self._living()
         lost = [index for index in waiting if self._homes[index] not in living]
         if not lost:
             return []
-        _LOG.warning("%d of %d chunks lost their worker and are opened again", len(lost), len(self._homes))
+        _LOG.warning(
+            "the workers of %d of %d chunks died; these chunks are opened again", len(lost), len(self._homes)
+        )
         living = self._living(at_least=self._most_workers)
         for index in lost:
             waiting[index].cancel()
@@ -200,7 +202,7 @@ class DaskWorkers:
                 load[self._homes[index]] += 1
 
     def _living(self, at_least: int = 0) -> list[str]:
-        """Return the addresses of the living workers; if there are too few, wait for more.
+        """Return the addresses of the living workers; if too few are alive, wait for more.
 
         Raises:
             EngineError: No worker appeared within `NO_WORKER_WAIT`.
@@ -231,7 +233,7 @@ def scheduler_client(scheduler: str) -> Iterator[Client]:
     _wait_for_scheduler(scheduler)
     try:
         client = Client(scheduler, timeout=SCHEDULER_WAIT)
-    # Programs other than a scheduler may answer Dask's handshake with anything.
+    # A program other than a scheduler may answer Dask's handshake with arbitrary data.
     except (OSError, ValueError, TypeError, RuntimeError, AssertionError) as error:
         _refuse(scheduler, str(error))
     with client:
@@ -244,7 +246,7 @@ def _require_dask(option: str) -> None:
 
 
 def _wait_for_scheduler(scheduler: str) -> None:
-    """Wait until a program answers at an address; without the wait, Dask would log tracebacks.
+    """Wait until a program answers at an address; without this wait, Dask would log tracebacks.
 
     Raises:
         InputError: The address is malformed, or nothing answers there.
@@ -252,7 +254,8 @@ def _wait_for_scheduler(scheduler: str) -> None:
     match = _ADDRESS.fullmatch(scheduler)
     if match is None or not 1 <= int(match["port"]) <= 65_535:
         raise InputError(
-            f"--scheduler {shortened(scheduler)}: not an address; give a host and a port, for example tcp://10.0.0.1:8786"
+            f"--scheduler {shortened(scheduler)}: is not an address; give a host and a port, for example "
+            "tcp://10.0.0.1:8786"
         )
     host, end = match["host"].strip("[]"), time.monotonic() + SCHEDULER_WAIT
     while True:

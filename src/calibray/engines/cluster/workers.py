@@ -1,11 +1,11 @@
-"""Workers keep chunks of links for replay, and run the calls of an external program.
+"""Workers, which keep chunks of links for replay and run the calls of an external program.
 
-Objects that are kept with a chunk are made on one worker and stay there. Functions are sent to the worker, which
-returns only their results. Results are returned in the order of the chunk numbers, so sums over chunks do not depend on
-the workers.
+Objects that are kept with a chunk are made on one worker and stay on this worker. Functions are sent to the worker,
+which returns only the results. Results are returned in the order of the chunk numbers, so sums over chunks do not
+depend on the workers.
 
-Workers on this machine are processes that communicate only through pipes, which they inherit. No port is open, so no
-other user of the machine can send code to a worker or to the main process.
+Workers on this machine are processes that communicate only through inherited pipes. No port is open, so no other user
+of the machine can send code to a worker or to the main process.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from calibray.support.memory import available_memory
 from calibray.support.messages import shortened
 
 ALWAYS_ALLOWED: Final = 8
-"""Number of worker processes that are allowed on any machine, even one with few cores."""
+"""Number of worker processes that are allowed on any machine, even if the machine has few cores."""
 
 END_WAIT: Final = 5.0
-"""Longest wait for a process to end before it is killed [s]."""
+"""Maximum time to wait for a process to end before it is killed [s]."""
 
 _LOG: Final = logging.getLogger(__name__)
 _NUMBER: Final = itertools.count()
 _CAN_PIN: Final = hasattr(os, "sched_setaffinity")
 
 ObjectKey = tuple[int, int]
-"""Numbers of a handle and of a chunk, which together identify an object."""
+"""Number of a handle and number of a chunk, which together identify an object."""
 
 
 @runtime_checkable
@@ -69,10 +69,11 @@ class Workers(Protocol):
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a picklable function on the objects kept with every chunk, and return the results by chunk.
+        """Call a picklable function for every chunk, on the objects kept with it, and return the results by chunk.
 
-        The first arguments of the function are the objects, given by their handles from `keep`; the other arguments are
-        the same for all chunks. `answered` is called with a chunk's number after its answer has arrived.
+        The first arguments of the function are the objects, which `kept` identifies by their handles from `keep`. All
+        other arguments are the same for all chunks. `answered` is called with a chunk's number after its answer has
+        arrived.
 
         Raises:
             EngineError: Workers die repeatedly, or none is left.
@@ -84,9 +85,9 @@ class Workers(Protocol):
 class InProcess:
     """Runs the work in this process, one chunk at a time.
 
-    If `at_most` is given, at most this many chunks are kept; the others are made again for each call. If `at_most` is
-    None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept until they use a
-    third of the memory that was free at the start, because objects derived from them need about the same amount.
+    If `at_most` is given, at most this number of chunks is kept; the others are made again for each call. If `at_most`
+    is None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept until they
+    use a third of the memory that was free at the start, because objects derived from them need about the same amount.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -119,7 +120,7 @@ class InProcess:
     def _has_room(self, kept: int) -> bool:
         if self._at_most is not None:
             return kept < self._at_most
-        # Without a cache folder, a chunk that is not kept would have to be traced again for each question.
+        # Without a cache folder, a chunk that is not kept must be traced again for each question.
         return cache_folder() is None or available_memory() > self._reserve
 
 
@@ -150,8 +151,8 @@ class _Question:
 
     Attributes:
         function: The function to call.
-        arguments: Its arguments after the objects.
-        keys: Keys of the objects that are its first arguments.
+        arguments: Arguments of the function after the objects.
+        keys: Keys of the objects that are the first arguments of the function.
         recipes: Functions and sources from which the worker makes the objects that it does not have yet.
         handles: Handles that are still in use; objects of other handles are dropped.
     """
@@ -165,7 +166,7 @@ class _Question:
 
 @dataclass(eq=False)
 class _KeptInProcesses:
-    """Objects in worker processes, one per chunk."""
+    """Objects in worker processes, with one object per chunk."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -177,7 +178,7 @@ class _KeptInProcesses:
 
 @dataclass(eq=False)
 class _Worker:
-    """A process with its pipe, the keys of the objects that it holds, and its current chunk."""
+    """A worker process with its pipe, the keys of its objects, and its current chunk."""
 
     process: SpawnProcess
     pipe: Connection
@@ -189,8 +190,8 @@ class _Worker:
 class LocalWorkers:
     """Processes on this machine, started on first use, each with its share of the processor cores.
 
-    A chunk stays in one process. If a process dies, another one replaces it and makes its chunks' objects again.
-    `open_executor` returns an executor for the calls of an external program.
+    A chunk stays in one process. If a process dies, another process replaces it and makes the objects of its chunks
+    again. `open_executor` returns an executor for the calls of an external program.
     """
 
     def __init__(self, count: int, open_executor: Callable[[], Executor]) -> None:
@@ -237,7 +238,8 @@ class LocalWorkers:
     ) -> dict[int, Any]:
         self._start_all()
         count, answers = len(handles[0]), {}
-        # A chunk's number determines its worker, so that the next question finds the chunk's objects there.
+        # A chunk's number determines its worker, so that the worker already has the chunk's objects at the next
+        # question.
         waiting = [list(range(home, count, self._count))[::-1] for home in range(self._count)]
         while len(answers) < count:
             for home, worker in enumerate(self._workers):
@@ -311,7 +313,8 @@ class LocalWorkers:
             for key, handle in zip(keys, handles, strict=True)
             if key not in worker.objects
         }
-        # The objects that the worker has after this question: it drops those whose handles are not in use.
+        # The objects that the worker has after this question; the worker drops objects whose handles are no longer in
+        # use.
         worker.objects = {key for key in worker.objects if key[0] in alive} | set(keys)
         return _Question(function, arguments, keys, recipes, alive)
 
@@ -321,7 +324,7 @@ class LocalWorkers:
             worker.pipe.send_bytes(content)
 
     def _receive(self) -> list[tuple[int, tuple[Any, Exception | None] | None]]:
-        """The answers received, each with the number of its worker; None for a worker that died."""
+        """The received answers, each with the number of its worker; the answer of a worker that died is None."""
         homes = {worker.pipe: home for home, worker in enumerate(self._workers)}
         answers: list[tuple[int, tuple[Any, Exception | None] | None]] = []
         for pipe in cast(list[Connection], wait(list(homes), POLL)):
@@ -384,7 +387,7 @@ def _sendable(error: Exception) -> Exception:
 
 
 def _pin(home: int, count: int) -> None:
-    """Assign a process its share of the cores, before any library that counts cores is loaded.
+    """Assign its share of the cores to a process before any library that counts cores is loaded.
 
     Otherwise, the thread pools of Dr.Jit and XLA in every process would use all cores and slow each other down.
     """
@@ -397,11 +400,11 @@ def check_workers(workers: object) -> None:
     """Refuse anything but workers or None.
 
     Raises:
-        InputError: The argument is something else, such as a number.
+        InputError: The argument is of another type, such as a number.
     """
     if not isinstance(workers, Workers | None):
         raise InputError(
-            f"workers: is {shortened(repr(workers))}, must be workers from engines.open_workers(NUMBER)"
+            f"workers: is {shortened(repr(workers))}; it must be workers from engines.open_workers(NUMBER)"
         )
 
 
@@ -412,11 +415,11 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
     Args:
         workers: Number of workers on this machine: processes that keep chunks of links, or external programs that run
             in parallel.
-        scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". Its workers need Calibray and access
-            to the study's folder under the same path.
+        scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". The workers of the scheduler need
+            Calibray, and access to the study's folder under the same path.
 
     Yields:
-        The workers; None if neither is given.
+        The workers; None if neither argument is given.
 
     Raises:
         InputError: Both arguments are given, the number is below 1, Dask is not installed, or no scheduler answers.
@@ -424,11 +427,11 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler: give only one of the two; a cluster has its own workers")
     if isinstance(workers, bool) or not isinstance(workers, int | None):
-        raise InputError(f"workers: is {workers!r}, must be a whole number")
+        raise InputError(f"workers: is {workers!r}; it must be a whole number")
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: must be at least 1")
     if not isinstance(scheduler, str | None):
-        raise InputError(f"scheduler: is {scheduler!r}, must be an address such as 'tcp://10.0.0.1:8786'")
+        raise InputError(f"scheduler: is {scheduler!r}; it must be an address such as 'tcp://10.0.0.1:8786'")
     with ExitStack() as opened:
         if scheduler is not None:
             client = opened.enter_context(scheduler_client(scheduler))

@@ -27,19 +27,25 @@ SCHEMA: Final = "calibray.request"
 VERSION: Final = 1
 ANSWER: Final = "path_loss_db"
 OBSERVABLES: Final = "observables"
-RESPONSE: Final = "its response"
+RESPONSE: Final = "the response"
 """Name of the response in messages."""
 
 RAY_COLUMNS: Final = ("path", "point")
-"""Columns of a ray table that a response with path loss does not have."""
+"""Columns that a ray table has and a response with path loss does not have."""
 PATH_LOSS_DB: Final = (20.0, 300.0)  # range of plausible path loss [dB]
-RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response [bytes]: fixed part, and part per link
-RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: a few hundred paths per link
+RESPONSE_BYTES: Final = (
+    16 << 20,
+    4 << 10,
+)  # maximum size of a response [bytes]: fixed part, and part per link
+RAYS_BYTES: Final = (
+    16 << 20,
+    64 << 10,
+)  # maximum size of a response with rays, for a few hundred paths per link
 _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
 class Unusable(ValueError):
-    """The answer is missing, malformed, of the wrong length, or not a number."""
+    """The answer is missing or malformed, has the wrong length, or is not a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +91,8 @@ class Request:
         return [wanted.record() for wanted in self.radio.observables]
 
     def _json(self) -> dict[str, Any]:
-        # Materials and parameters are lists: MATLAB turns the keys of an object into identifiers, and would garble
-        # names such as "walls.relative_permittivity".
+        # Materials and parameters are written as lists, because MATLAB turns the keys of an object into identifiers and
+        # would garble names such as "walls.relative_permittivity".
         links = {"tx": self.tx.tolist(), "rx": self.rx.tolist()}
         if self.link_frequency is not None:
             links["frequency"] = self.link_frequency.tolist()
@@ -141,7 +147,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
 def read_answer(
     path: Path, file_format: str, num_links: int, num_observables: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read a program's response: path loss [L], [dB], and further observables [K, L], in their units.
+    """Read a program's response: path loss [L], [dB], and further observables [K, L] in their own units.
 
     Path loss is +inf for a link without a path; an observable is NaN for a link without a value.
 
@@ -157,7 +163,7 @@ def read_answer(
         values = values.reshape(-1)
     if values.shape != (num_links,):
         raise Unusable(
-            f"its response contains {ANSWER} of shape {values.shape}; it must be ({num_links},): one value per link"
+            f"the response contains {ANSWER} of shape {values.shape}; it must be ({num_links},): one value per link"
         )
     lower, upper = PATH_LOSS_DB
     wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
@@ -165,7 +171,7 @@ def read_answer(
         link = int(np.argmax(wrong))
         hint = "; path loss is positive; does the program return gains?" if -upper <= values[link] < 0 else ""
         raise Unusable(
-            f"its response contains {ANSWER}[{link}] = {values[link]:g}; it must be a number between {lower:g} and "
+            f"the response contains {ANSWER}[{link}] = {values[link]:g}; it must be a number between {lower:g} and "
             f"{upper:g} dB, or infinite if the link has no path{hint}"
         )
     shape = num_observables, num_links
@@ -176,7 +182,7 @@ def read_answer(
         observed = observed.reshape(shape)
     if observed.shape != shape:
         raise Unusable(
-            f"its response contains {OBSERVABLES} of shape {observed.shape}; it must be {shape}: a list with one value "
+            f"the response contains {OBSERVABLES} of shape {observed.shape}; it must be {shape}: a list with one value "
             "per link for each observable, in the order of the request"
         )
     return values, np.where(np.isfinite(observed), observed, np.nan)
@@ -205,23 +211,24 @@ def read_rays(path: Path, num_links: int) -> bytes:
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
-    """The bytes of a response. Only a regular file is read, because a program can leave anything at this path."""
+    """The bytes of a response. Only a regular file is read, because a program can leave anything at the path."""
     try:
-        # O_NOFOLLOW does not follow a link; O_NONBLOCK does not wait for the writer of a FIFO.
+        # With O_NOFOLLOW, `open` does not follow a link; with O_NONBLOCK, `open` does not wait for the writer of a
+        # FIFO.
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
-        raise Unusable("it wrote no response file") from None
+        raise Unusable("the program wrote no response file") from None
     except OSError as error:
         raise Unusable(
-            f"its response cannot be read ({error.strerror}); it must be a regular file, not a link"
+            f"the response cannot be read ({error.strerror}); it must be a regular file, not a link"
         ) from None
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
-        raise Unusable("its response is a folder, a FIFO or a device; it must be a regular file")
+        raise Unusable("the response is a folder, a FIFO or a device; it must be a regular file")
     with os.fdopen(handle, "rb") as file:
         if status.st_size > limit:
-            raise Unusable(f"its response has {status.st_size:,} bytes; it must have {limit:,} or fewer")
+            raise Unusable(f"the response has {status.st_size:,} bytes; it must have {limit:,} or fewer")
         return file.read(limit)
 
 
@@ -229,27 +236,27 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
     try:
         content = json.loads(response.decode("utf-8-sig"))  # some programs begin with a byte order mark
     except ValueError as error:
-        raise Unusable(f"its response is not JSON ({error})") from None
+        raise Unusable(f"the response is not JSON ({error})") from None
     except RecursionError:
-        raise Unusable("its response nests lists or objects too deeply") from None
+        raise Unusable("the response nests lists or objects too deeply") from None
     if not isinstance(content, dict) or name not in content:
         rows = content[0] if isinstance(content, list) and content else content
-        raise Unusable(f"its response has no key {name!r}{_rays_hint(rows)}")
+        raise Unusable(f"the response has no key {name!r}{_rays_hint(rows)}")
     entries = content[name]
-    # MATLAB writes a list of one number as that number.
+    # MATLAB writes a list of one number as a plain number.
     entries = entries if isinstance(entries, list) else [entries]
     if name == OBSERVABLES and all(isinstance(entry, list) for entry in entries):
         rows = [[_number(entry, name) for entry in row] for row in entries]
         if len({len(row) for row in rows}) > 1:
             raise Unusable(
-                f"its response contains {name} with lists of different lengths; each must have one value per link"
+                f"the response contains {name} with lists of different lengths; each list must have one value per link"
             )
         return np.array(rows)
     return np.array([_number(entry, name) for entry in entries])
 
 
 def _rays_hint(names: Any) -> str:
-    """The remedy if a response with these names is a ray table; otherwise empty."""
+    """The remedy if a response with these names is a ray table; otherwise an empty string."""
     is_table = isinstance(names, dict | list) and all(name in names for name in RAY_COLUMNS)
     return "; it is a ray table: set rays = true in [engine]" if is_table else ""
 
@@ -259,11 +266,11 @@ def _number(entry: Any, name: str) -> float:
         return np.inf
     if isinstance(entry, bool) or not isinstance(entry, int | float):
         text = json.dumps(entry) if isinstance(entry, str | bool) else reprlib.repr(entry)
-        raise Unusable(f"its response contains {text[:80]} in {name}, which is not a number")
+        raise Unusable(f"the response contains {text[:80]} in {name}, which is not a number")
     try:
         return float(entry)
     except OverflowError:
-        raise Unusable(f"its response contains a number in {name} that is too large") from None
+        raise Unusable(f"the response contains a number in {name} that is too large") from None
 
 
 def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
@@ -271,27 +278,27 @@ def _read_hdf5(response: bytes, name: str, size: int) -> NDArray[np.float64]:
         with h5py.File(BytesIO(response), "r") as file:
             link = file.get(name, getlink=True)
             if link is None:
-                raise Unusable(f"its response has no dataset {name!r}{_rays_hint(list(file))}")
+                raise Unusable(f"the response has no dataset {name!r}{_rays_hint(list(file))}")
             if not isinstance(link, h5py.HardLink):
                 raise Unusable(
-                    f"its response links {name!r} to another object; write the numbers instead of the link"
+                    f"the response links {name!r} to another object; write the numbers instead of the link"
                 )
             dataset = file[name]
             if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
-                raise Unusable(f"its response has {name!r}, which is not a dataset of numbers")
+                raise Unusable(f"the response contains {name!r}, which is not a dataset of numbers")
             if dataset.is_virtual or dataset.external:
                 raise Unusable(
-                    f"its response stores {name!r} in other files; write the numbers into the response file"
+                    f"the response stores {name!r} in other files; write the numbers into the response file"
                 )
-            # Checked before it is read, because a small compressed file may unpack to any size.
+            # The size is checked before the dataset is read, because a small compressed file may unpack to any size.
             if dataset.size != size:
                 raise Unusable(
-                    f"its response contains {name} of shape {dataset.shape}; it must contain {size} numbers"
+                    f"the response contains {name} of shape {dataset.shape}; it must contain {size} numbers"
                 )
             return np.asarray(dataset[()], dtype=float)
     except Unusable:
         raise
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise Unusable(
-            f"its response is not an HDF5 file with a numeric dataset {name!r} ({error})"
+            f"the response is not an HDF5 file with a numeric dataset {name!r} ({error})"
         ) from None

@@ -1,12 +1,13 @@
 """The guard runs an external program, limits its output, and finally kills all processes that the program started.
 
-This is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of Calibray.
-It runs as a process between Calibray and the program for two reasons. First, on Linux it adopts orphans
-(PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's process group and session. Second, it outlives
-Calibray: when its standard input ends because Calibray ended or stopped the call, it kills the program and removes the
-folder.
+The guard is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of
+Calibray. The guard runs as a process between Calibray and the program for two reasons. First, on Linux the guard adopts
+orphaned processes (PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's process group and session.
+Second, the guard outlives Calibray: when its standard input ends because Calibray ended or stopped the call, the guard
+kills the program and removes the folder.
 
-It prints one JSON object with the keys `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and `output`.
+The guard prints one JSON object with the keys `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and
+`output`.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ if __name__ == "__main__":
     sys.path.append(sys.argv[1])
 
 HEAD, TAIL = 500, 1500  # bytes that are kept from the start and the end of an output
-KILL_TIME = 5.0  # longest time to keep killing processes [s]
-POLL = 0.5  # the guard checks whether Calibray is alive, and Calibray whether to stop, at this interval [s]
+KILL_TIME = 5.0  # maximum time to keep killing processes [s]
+POLL = 0.5  # interval at which the guard checks whether Calibray is alive and Calibray checks whether to stop [s]
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
 
 class Output:
-    """The start and the end of a stream of any length."""
+    """The beginning and the end of a stream of any length."""
 
     def __init__(self) -> None:
         self.head, self.tail, self.length = b"", b"", 0
@@ -85,7 +86,7 @@ def main(timeout: float, words: list[str]) -> dict[str, object]:
 
 
 def _prctl():
-    """The system call with which a process adopts orphans or dies with its parent; a dummy function except on Linux."""
+    """The system call that makes a process adopt orphans or die with its parent; a dummy function except on Linux."""
     if sys.platform != "linux":
         return lambda option, value: None
     library = ctypes.CDLL(None)
@@ -103,7 +104,7 @@ def _signal_pipe() -> int:
 
 
 def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: dict[int, Output]) -> str:
-    """Read the program's output until there is a reason to stop, and return this reason."""
+    """Read the program's output until there is a reason to stop, and return the reason."""
     parent, calibray = os.getppid(), sys.stdin.fileno()
     with selectors.DefaultSelector() as selector:
         for source in (signals, calibray, *outputs):
@@ -127,8 +128,8 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
 
 
 def _kill_tree(process: subprocess.Popen) -> None:
-    """Kill the program's process group, and then all descendants of this process until none is left."""
-    # On Linux the guard adopts orphans; elsewhere they are found only if they are listed before their parent ends.
+    """Kill the program's process group, and then all descendants of the guard until none is left."""
+    # On Linux, the guard adopts orphans; elsewhere, orphans are found only if they are listed before their parent ends.
     adopts = sys.platform == "linux"
     if adopts:
         _kill_group(process)
@@ -145,7 +146,8 @@ def _kill_tree(process: subprocess.Popen) -> None:
             with suppress(psutil.Error):
                 descendant.kill()
         psutil.wait_procs(descendants, timeout=0.01)
-        # Processes may have started others since, and this process has adopted the children of those it killed.
+        # In the meantime, processes may have started others, and the guard has adopted the children of the killed
+        # processes.
         descendants = guard.children(recursive=True)
 
 
@@ -156,7 +158,7 @@ def _kill_group(process: subprocess.Popen) -> None:
 
 
 def _has_child() -> bool:
-    """Whether this process still has a child after all children that have ended are reaped."""
+    """Whether the guard still has a child after all ended children are reaped."""
     with suppress(ChildProcessError):
         while os.waitpid(-1, os.WNOHANG)[0]:
             pass

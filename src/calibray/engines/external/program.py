@@ -1,4 +1,4 @@
-"""Calls of an external program for one candidate: request and response files, time limit and attempts."""
+"""Calls of an external program for one candidate, with request and response files, a time limit and retries."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 
 PLACEHOLDERS: Final = ("{request}", "{response}")
-GUARD_WAIT: Final = 2 * KILL_TIME  # longest wait for a guard to kill its program [s]
+GUARD_WAIT: Final = 2 * KILL_TIME  # maximum time to wait for a guard to kill its program [s]
 PREFIX: Final = "calibray-call-"  # prefix of the names of temporary folders of calls
 OWNER_FILE: Final = "owner.json"
 
@@ -50,7 +50,7 @@ class Unstartable(Unusable):
 
 
 class Lost(Unusable):
-    """The program's guard ended, which is not the program's fault."""
+    """The guard of the program ended, which is not the program's fault."""
 
 
 class Stopped(Exception):
@@ -62,7 +62,7 @@ class Outcome:
     """Outcome of all attempts to run the program for one candidate.
 
     Attributes:
-        path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if the attempts failed.
+        path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if all attempts failed.
         seconds: Total duration of all attempts [s].
         failure: Error of the last attempt; empty if it succeeded.
         rays: The response of a program that returns rays; otherwise further observables [K, L] in SI units as
@@ -82,8 +82,8 @@ class ExternalProgram:
     """An external program with the settings of its calls; picklable, for calls on other machines.
 
     Attributes:
-        words: The program and its arguments. The paths of the files replace `{request}` and `{response}`; a path whose
-            placeholder is absent is appended.
+        words: The program and its arguments. The file paths replace the placeholders `{request}` and `{response}`; a
+            path without a placeholder is appended.
         folder: Folder in which the program runs.
         timeout: Time limit for one attempt [s].
         retries: Number of further attempts after a failure.
@@ -112,8 +112,8 @@ class ExternalProgram:
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
         """Call the program for one candidate; after a failure, call it again until no attempts are left.
 
-        A failure is returned instead of raised, so that only one candidate is lost, not the batch. Another thread can
-        set `stop` to kill the program.
+        A failure is returned instead of raised, so that only one candidate is lost and not the whole batch. Another
+        thread can set `stop` to kill the program.
 
         Raises:
             Stopped: `stop` was set before the program answered.
@@ -166,13 +166,13 @@ class ExternalProgram:
                     return read_rays(response_file, num_links)
                 wanted = request.radio.observables
                 loss, observed = read_answer(response_file, self.file_format, num_links, len(wanted))
-                # Programs answer in the units of the study.
+                # Programs return observables in the units of the study.
                 scale = np.array([each.scale for each in wanted])[:, None]
                 return loss, observed * scale if wanted else observed
             except Unusable as error:
                 output = report["output"]
                 raise Unusable(
-                    f"{error}; its output:\n{output}" if output else f"{error}; it gave no output"
+                    f"{error}; its output:\n{output}" if output else f"{error}; the program printed no output"
                 ) from None
 
     def _command_line(self, request_file: Path, response_file: Path) -> list[str]:
@@ -186,7 +186,7 @@ class ExternalProgram:
 
     def _run_guarded(self, folder: Path, words: list[str], stop: Event | None) -> dict:
         """Run the program under its guard (see `guard`), and return the guard's report."""
-        # The guard kills the program once the other end of its standard input is closed.
+        # The guard kills the program when the other end of the guard's standard input is closed.
         guard_input, leash = os.pipe()
         try:
             process = subprocess.Popen(
@@ -220,7 +220,7 @@ class ExternalProgram:
 
 
 def _last_report(guard: subprocess.Popen) -> bytes:
-    """The report of a guard whose standard input was closed; the guard first kills its program."""
+    """The report of a guard whose standard input was closed; before it reports, the guard kills its program."""
     try:
         return guard.communicate(timeout=GUARD_WAIT)[0]
     except subprocess.TimeoutExpired:
@@ -239,7 +239,7 @@ def _describe_status(status: int) -> str:
 
 @contextmanager
 def _call_folder() -> Iterator[Path]:
-    """A temporary folder for one call, with a file that names the owner; folders of ended processes are removed."""
+    """A temporary folder for one call, with a file that names the owner; folders whose owner has ended are removed."""
     try:
         parent = Path(tempfile.gettempdir())
         _remove_abandoned(parent)

@@ -1,4 +1,4 @@
-"""The kinds of engines, one per module; a new module in this folder adds a kind and its section to study files."""
+"""The kinds of engines, one per module; a new module in this folder adds a kind and its study section."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ KINDS: Final = _sections()
 """The sections of all kinds of engines, by name."""
 
 DEFAULT: Final = "replay"
-"""The kind that a study without ``[engine]`` uses."""
+"""The kind of engine that a study without ``[engine]`` uses."""
 
 
 def default() -> EngineSection:
@@ -43,4 +43,4 @@ if TYPE_CHECKING:
     AnyEngine = EngineSection
 else:
     AnyEngine = Annotated[reduce(or_, KINDS.values()), Field(discriminator="name")]
-"""The section of any kind of engine; its name determines the kind."""
+"""The section of any kind of engine; the key `name` determines the kind."""

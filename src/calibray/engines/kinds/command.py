@@ -1,4 +1,4 @@
-"""Command: an external program computes path loss for candidates, one at a time or in parallel."""
+"""Command: an external program computes path loss for candidates, sequentially or in parallel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from calibray.engines.section import EngineSection, OpenedStudy
 from calibray.errors import EngineError, InputError
 from calibray.measurements.observables import Statistic
 from calibray.support.interruption import acknowledge_interruption
-from calibray.support.messages import printable
+from calibray.support.messages import counted, printable
 from calibray.support.output_files import exists, file_digest
 from calibray.support.progress import Progress
 from calibray.support.strict_models import Text
@@ -40,7 +40,7 @@ class CommandSection(EngineSection):
         name: "command".
         command: The program to call, and its arguments.
         timeout: Time limit for one attempt [s].
-        retries: Number of further attempts after a failure.
+        retries: Number of further attempts after a failed attempt.
         format: Format of the files exchanged with the program: "json" or "hdf5".
         give_up_after: Number of successive failed calls after which the run ends.
         rays: Whether the program returns a ray table instead of path loss.
@@ -49,7 +49,7 @@ class CommandSection(EngineSection):
     expensive: ClassVar[bool] = True
     external: ClassVar[bool] = True
 
-    # Sections are frozen, so a narrower type is safe.
+    # Sections are immutable, so a narrower type is safe.
     name: Literal["command"] = "command"  # pyright: ignore[reportIncompatibleVariableOverride]
     command: Annotated[tuple[Text, ...], Field(min_length=1)] = ()
     timeout: Annotated[float, Field(gt=0)] = 3600.0
@@ -67,11 +67,11 @@ class CommandSection(EngineSection):
         return self
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
-        """The command line, and "rays" if the program returns rays; the program's version is unknown."""
+        """The command line, and "rays" if the program returns rays; the version of the program is unknown."""
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
-        """SHA-256 of the files that are named on the command line and lie in the study's folder, by name."""
+        """SHA-256 by name of the files that are named on the command line and are in the study's folder."""
         folder = study.source.resolve().parent
         files = {word: folder / word for word in self.command if exists(folder / word)}
         return {word: file_digest(file) for word, file in files.items() if file.is_relative_to(folder)}
@@ -93,9 +93,9 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only this candidate is lost: every link counts as a link without a path. The run
-    ends if every candidate of the first batch fails or if `give_up_after` successive calls fail, because the fault is
-    then probably in the program.
+    If all attempts of a call fail, only its candidate is lost: every link counts as a link without a path. The run ends
+    if every candidate of the first batch fails or if `give_up_after` successive calls fail, because the program is then
+    probably at fault.
 
     Args:
         program: The program, with the settings of its calls.
@@ -140,7 +140,7 @@ class Command:
         values = check_candidates(candidates, len(self.parameters))
         if derivatives or wanted != tuple(each.statistic for each in self._study.radio.observables):
             raise InputError(
-                f"{self._source}: the program returns only the observables that the study lists, and no "
+                f"{self._source}: the program returns only the observables that the study lists, but no "
                 "derivatives"
             )
         return gather_responses(self.answers(values), (len(values), self.num_links), len(wanted), first)
@@ -148,7 +148,7 @@ class Command:
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Yield the answer to each candidate as soon as its call ends; see `Answering.answers`."""
         if not self.calls:
-            # A study may come from someone else, so the user must see what it runs on this machine.
+            # A study may come from someone else, so the user must see which program it runs on this machine.
             _LOG.warning(
                 "%s runs a program in %s: %s", printable(str(self._source)), printable(str(self._program.folder)),
                 printable(shlex.join(self._program.words)),
@@ -166,17 +166,18 @@ class Command:
                 self._progress("running", done, len(requests))
             failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
             yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays, outcome.lost)
-            # Counted after the answer was yielded, so that the caller can store it before the run ends.
+            # The failure is counted after the answer was yielded, so that the caller can store the answer before the
+            # run ends.
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
                 raise EngineError(
-                    f"{failure}; the {self._successive_failures - 1} calls before it also failed. All answers are in "
-                    "the ledger. Correct the program, remove the failures with `calibray ledger DIR --forget-failed`, "
-                    "and start the run again"
+                    f"{failure}; the run ends after {counted(self._successive_failures, 'successive failed call')}. "
+                    "All answers are in the ledger. Correct the program, remove the failures with `calibray ledger DIR "
+                    "--forget-failed`, and start the run again"
                 )
 
     def _with_path_loss(self, outcome: Outcome) -> Outcome:
-        """The outcome with the path loss computed from its rays, or with the error found in the rays."""
+        """The outcome, with the path loss computed from its rays or with the error that the rays caused."""
         from calibray.engines.rays.export import Export
 
         try:
@@ -193,7 +194,8 @@ class Command:
     def _parallel(
         self, requests: list[Request], stop: Event, executor: Executor
     ) -> Iterator[tuple[int, Outcome]]:
-        # An event reaches only threads; programs on other machines run until they end or exceed their time limit.
+        # An event reaches only the threads of this process; programs on other machines run until they end or exceed
+        # their time limit.
         threads = executor if isinstance(executor, ThreadPoolExecutor) else None
         local_stop = None if threads is None else stop
         waiting, interruption = iter(enumerate(requests)), None
@@ -209,14 +211,16 @@ class Command:
                 for future in wait(pending, POLL, FIRST_COMPLETED).done:
                     outcome = self._outcome(future)
                     yield pending.pop(future), outcome
-                    # A call starts only after an answer is stored, so a killed run loses at most one call per thread.
+                    # A new call starts only after an answer is stored, so a killed run loses at most one call per
+                    # thread.
                     if not stop.is_set():
                         start(1)
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
             acknowledge_interruption()
         finally:
-            # If all calls have ended, `stop` stays unset, so the caller can still wait for the answers of another run.
+            # If all calls have ended, `stop` remains unset, so the caller can still wait for the answers of another
+            # run.
             if pending:
                 stop.set()
             for future in pending:

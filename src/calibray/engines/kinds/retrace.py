@@ -31,7 +31,7 @@ class RetraceSection(EngineSection):
     expensive: ClassVar[bool] = True
     external: ClassVar[bool] = False
 
-    # Sections are frozen, so a narrower type is safe.
+    # Sections are immutable, so a narrower type is safe.
     name: Literal["retrace"] = "retrace"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
@@ -59,7 +59,7 @@ class CarrierTracer:
     """The ray tracer at one carrier.
 
     Attributes:
-        tracer: The ray tracer with its scene; the materials have their constants at this carrier, before calibration.
+        tracer: The ray tracer with its scene, whose materials have their constants at this carrier before calibration.
         links: The links measured at this carrier.
         index: Indices of these links among all links [l].
     """

@@ -1,11 +1,11 @@
-"""The SQLite file of a ledger: tables, transactions, errors, and entries with a digest that reveals damage.
+"""The SQLite file of a ledger: tables, transactions, errors, and entries whose digest reveals damage.
 
-A rescue file is written next to the ledger. If that folder is missing or full, the file is written to the user's state
-folder or the temporary folder. The next run with the same ledger reads the file.
+A rescue file is written next to the ledger. If the ledger's folder is missing or full, the rescue file is written to
+the user's state folder or the temporary folder. The next run with the same ledger reads the rescue file.
 
 A claim states which run computes a candidate, so that two runs with one ledger do not compute the same candidate. A
-claim is valid as long as its run renews it. It ends immediately if the run's process is known to have ended. Each run
-times the renewals of other runs with its own clock, because the clocks of two machines can differ by hours.
+claim is valid as long as its run renews it. A claim ends immediately if the process of its run is known to have ended.
+Each run times the renewals of other runs with its own clock, because the clocks of two machines can differ by hours.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ _CLAIMS: Final = """CREATE TABLE IF NOT EXISTS claims (
     problem TEXT NOT NULL, candidate BLOB NOT NULL, run TEXT NOT NULL, owner TEXT NOT NULL, expires REAL NOT NULL,
     PRIMARY KEY (problem, candidate)) WITHOUT ROWID"""
 EXPIRY: Final = 300.0  # a claim ends if another run observes no renewal for this time [s]
-SKEW: Final = 86_400.0  # largest accepted difference between the clocks of two machines [s]
-RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few may fail
+SKEW: Final = 86_400.0  # maximum accepted difference between the clocks of two machines [s]
+RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few renewals may fail
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
-"""For each claim of another run: its latest `expires`, and the time when it changed, on this process's clock [s]."""
+"""For each claim of another run: its latest value of `expires`, and the time of its last change on the clock of this
+process [s]."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
@@ -70,10 +71,11 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
 def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
     """Whether a claim of another run is still valid.
 
-    A claim is invalid if its process has ended or has not renewed the claim for `EXPIRY`. `expires` and `now` are times
-    [s since 1970] on the clocks of the claim's machine and of this machine.
+    A claim is invalid if its process has ended, or has not renewed the claim for a time of `EXPIRY`. `expires` and
+    `now` are times [s since 1970] on the clocks of the claim's machine and of this machine.
     """
-    # A clock may be wrong by `SKEW`; a claim with an expiry further from now is damaged or was left behind.
+    # A clock may be wrong by `SKEW`; a claim whose expiry differs from the present time by more is damaged or
+    # abandoned.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
     try:
@@ -118,7 +120,7 @@ def renewing(file: Path, run: str) -> Iterator[None]:
 
 def _renew(file: Path, run: str, ended: Event) -> None:
     while not ended.wait(RENEWAL):
-        # If the ledger cannot be written, storing the engine's next answer fails and reports this.
+        # If the ledger cannot be written, storing the engine's next answer fails and reports the error.
         with (
             suppress(sqlite3.Error),
             closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True, isolation_level=None)) as ledger,
@@ -127,7 +129,7 @@ def _renew(file: Path, run: str, ended: Event) -> None:
 
 
 RANGE_DB: Final = (-100.0, 10_000.0)
-"""Range of path loss that every engine respects [dB]; other values indicate damage."""
+"""Range of path loss that every engine respects [dB]; values outside this range indicate damage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +164,7 @@ class LedgerEntry:
 
     @property
     def fault(self) -> str:
-        """The reason why an engine cannot have returned this answer; empty if the answer is possible."""
+        """The reason why no engine can have returned this answer; empty if the answer is possible."""
         values, (lower, upper) = self.path_loss_db, RANGE_DB
         outside = ~((values >= lower) & (values <= upper) | np.isposinf(values))
         if outside.any():
@@ -196,7 +198,7 @@ def key(candidate: NDArray[np.float64]) -> bytes:
 
 VERSION: Final = 2
 ENDINGS: Final = ("", "-wal", "-shm", "-journal")  # endings that SQLite appends to the ledger's name
-LOCK_WAIT: Final = 60.0  # longest wait for other writers [s]
+LOCK_WAIT: Final = 60.0  # maximum time to wait for other writers [s]
 _PROBLEMS: Final = """CREATE TABLE IF NOT EXISTS problems (
     problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID"""
 _ANSWERS: Final = """CREATE TABLE IF NOT EXISTS answers (
@@ -220,8 +222,8 @@ def check_own_file(path: Path) -> None:
     """Refuse a ledger path that leads to another file, because SQLite would write to that file.
 
     Raises:
-        InputError: The file, or a file that SQLite keeps next to it, is a link, a folder, a device or a FIFO, or has
-            other names (hard links).
+        InputError: The file, or a file that SQLite keeps next to the ledger, is a link, a folder, a device or a FIFO,
+            or has several names (hard links).
     """
     for ending in ENDINGS:
         file = path.with_name(path.name + ending)
@@ -246,7 +248,7 @@ def set_up(connection: sqlite3.Connection, path: Path) -> None:
 
     Raises:
         InputError: The file is another database, or a ledger of another version.
-        sqlite3.OperationalError: Other programs lock the file for too long, or the file cannot be used.
+        sqlite3.OperationalError: Another program locks the file for too long, or the file cannot be used.
         sqlite3.DatabaseError: The file is damaged.
     """
     deadline = time.monotonic() + LOCK_WAIT
@@ -328,7 +330,7 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 
 def explain(error: sqlite3.Error | OSError) -> str:
-    """The text of a ledger error, with its remedy."""
+    """The text of a ledger error, followed by a remedy."""
     # The lowest byte is the kind of error; the others are details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
     damaged = "move it away and start again, or recover its contents with `sqlite3 FILE .recover`"
@@ -376,7 +378,7 @@ def rescue_files(ledger: Path) -> Iterator[Path]:
         for file in sorted(folder.glob(f"{prefix}*{SUFFIX}")):
             try:
                 status = file.lstat()
-                # The temporary folder is open to all users: another user's file must not become an answer.
+                # All users can write to the temporary folder, so a file of another user must not be accepted.
                 if not stat.S_ISREG(status.st_mode) or (
                     folder != ledger.parent and status.st_uid != os.geteuid()
                 ):
@@ -400,6 +402,6 @@ def _folders(ledger: Path) -> Iterator[tuple[Path, str]]:
     yield ledger.parent, PREFIX
     prefix = f"{PREFIX}{hashlib.sha256(str(ledger).encode()).hexdigest()[:16]}-"
     state = user_state_path("calibray", appauthor=False)
-    if state.is_absolute():  # it begins with "~" for a user without a home folder
+    if state.is_absolute():  # the path begins with "~" for a user without a home folder
         yield state, prefix
     yield Path(tempfile.gettempdir()) / f"calibray-rescue-{os.geteuid()}", prefix

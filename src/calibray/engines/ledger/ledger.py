@@ -1,8 +1,8 @@
 """The ledger stores every completed RT call in one SQLite file.
 
-An answer is committed before the optimizer receives it, so a killed run finds its answers when it is started again.
+Each answer is committed before the optimizer receives it, so a killed run finds its answers when it is started again.
 Several runs can write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead
-log requires one. Answers that cannot be stored in the ledger are written to a rescue file (see `Ledger.rescue`).
+log requires one. Answers that the ledger cannot store are written to a rescue file (see `Ledger.rescue`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import pandas as pd
 
 from calibray.engines.ledger import database
 from calibray.errors import EngineError, InputError
+from calibray.support.messages import counted
 
 LEDGER_FILE: Final = "ledger.sqlite"
 COLUMNS: Final = ("problem", "engine", "time", "seconds", "status", "message")
@@ -37,7 +38,8 @@ class Ledger:
     """Stored RT calls by problem and candidate.
 
     Args:
-        path: The SQLite file; created with its folder if absent. A file that cannot be written is opened read-only.
+        path: The SQLite file, which is created with its folder if it does not exist. A file that cannot be written is
+            opened read-only.
 
     Attributes:
         read_only: Whether the file cannot be written.
@@ -57,7 +59,7 @@ class Ledger:
             database.check_own_file(self.path)
             self._connection = self._connect()
             try:
-                # SQLite opens the file by name, so it may have been replaced in the meantime.
+                # SQLite opens the file by name, so the file may have been replaced in the meantime.
                 database.check_own_file(self.path)
                 database.set_up(self._connection, self.path)
                 self._file = _identity(self.path)
@@ -79,7 +81,7 @@ class Ledger:
                     shutil.copyfile(f"{self.path}{ending}", f"{file}{ending}")
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
-        # Without an isolation level, every statement is a transaction, which is committed when `execute` returns.
+        # Without an isolation level, every statement is a transaction that is committed when `execute` returns.
         return sqlite3.connect(file, timeout=database.LOCK_WAIT, isolation_level=None)
 
     def _insert_rescued(self) -> None:
@@ -119,8 +121,8 @@ class Ledger:
     def changed_program_files(self, problem: str, files: Mapping[str, str]) -> list[str]:
         """Names of a program's files that have changed since its calls were stored.
 
-        `files` contains the current files with their digests. If the problem has no stored calls, these digests are
-        stored.
+        `files` contains the current files with their digests. If the problem has no stored calls, the current digests
+        are stored.
 
         Raises:
             EngineError: The ledger cannot be read or written.
@@ -135,7 +137,7 @@ class Ledger:
         return [name for name, digest in files.items() if earlier.get(name, digest) != digest]
 
     def find(self, problem: str, candidate: bytes, num_links: int) -> database.LedgerEntry | None:
-        """The entry of a candidate, or None; a damaged entry is deleted with a warning.
+        """The entry of a candidate; None if there is no entry. A damaged entry is deleted with a warning.
 
         Raises:
             EngineError: The ledger cannot be read.
@@ -157,7 +159,7 @@ class Ledger:
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
-        """Claim candidates that this run will compute; `commit` and the end of `working` release the claims.
+        """Claim the candidates that this run will compute; `commit` and the end of `working` release the claims.
 
         Returns the candidates that have no answer and are not claimed by another run.
 
@@ -167,7 +169,7 @@ class Ledger:
         """
         if self.read_only:
             raise InputError(
-                f"{self.path}: cannot be written, and {len(candidates)} candidates are not in it; "
+                f"{self.path}: cannot be written, and has no answer for {counted(len(candidates), 'candidate')}; "
                 "make it and its folder writable, or choose another folder"
             )
         self._check_identity()
@@ -221,7 +223,7 @@ class Ledger:
         return _describe_rescue(database.write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete the failed calls of one or all problems, so that they are run again; return their number.
+        """Delete the failed calls of one problem or of all problems, so that they are run again; return their number.
 
         Raises:
             InputError: The ledger is read-only.
@@ -281,7 +283,7 @@ class Ledger:
         if self.read_only or _identity(self.path) == self._file:
             return
         with self._errors():
-            # A removed file can still be read while it is open.
+            # A removed file can still be read as long as it is open.
             (count,) = self._connection.execute("SELECT COUNT(*) FROM answers").fetchone()
             rescued = _describe_rescue(database.write_rescue_file(self.path, self._connection.backup), count)
         raise EngineError(f"{self.path}: was removed or replaced during the run; {rescued}")

@@ -26,24 +26,25 @@ from calibray.support.progress import Progress
 _LOG: Final = logging.getLogger(__name__)
 SHORTEST_WAIT: Final = 0.02
 LONGEST_WAIT: Final = 1.0
-"""Shortest and longest intervals between checks for the answers of another run [s]."""
+"""Minimum and maximum intervals between checks for the answers of another run [s]."""
 
 
 @final
 class Recorded:
-    """An engine with a ledger; candidates that any run has completed are not run again.
+    """An engine with a ledger, so that a candidate that any run has completed is not run again.
 
     Args:
         engine: The engine.
         ledger: The ledger.
-        problem: Fingerprint of everything, except the candidate, that determines the engine's answers.
+        problem: Fingerprint of everything that determines the engine's answers, except the candidate.
         name: Name of the engine.
-        progress: Called with "waiting", the number of answers received from other runs, and the number awaited.
-        program_files: SHA-256 of the files of the engine's program, by name, if it has any.
+        progress: Called with "waiting", the number of answers received from other runs, and the number of awaited
+            answers.
+        program_files: SHA-256 of the files of the engine's program by name, if the program has files.
 
     Attributes:
-        hits: Number of candidates so far that required no RT call, because they were in the ledger or occurred earlier
-            in their batch.
+        hits: Number of candidates so far that required no RT call, because the candidate was in the ledger or occurred
+            earlier in the same batch.
     """
 
     def __init__(
@@ -95,13 +96,13 @@ class Recorded:
         """
         if derivatives:
             raise InputError(
-                f"engine {self._name!r}: provides no derivatives; use a method that needs none, such as 'auto'"
+                f"engine {self._name!r}: provides no derivatives; use a method without derivatives, such as 'auto'"
             )
         answers, first = self._all_answers(candidates)
         return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
 
     def _all_answers(self, candidates: NDArray[np.float64]) -> tuple[list[Answer], bool]:
-        """The answers to candidates, and whether these candidates are the first batch."""
+        """The answers for candidates, and whether these candidates are the first batch."""
         first = self.calls + self.hits == 0
         answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
         failures = [answer.failure for answer in answers if answer.failure]
@@ -143,7 +144,7 @@ class Recorded:
             before = len(missing)
             yield from self._from_ledger(missing)
             if len(missing) == before and missing:
-                # Another run has claimed these candidates and is computing them.
+                # Another run has claimed the missing candidates and is computing them.
                 if self._progress is not None:
                     self._progress("waiting", max(0, awaited - len(missing)), max(awaited, len(missing)))
                 time.sleep(pause)
@@ -154,13 +155,13 @@ class Recorded:
         files, self._unchecked_files = self._unchecked_files, {}
         if files and (changed := self._ledger.changed_program_files(self._problem, files)):
             _LOG.warning(
-                "%s: %s changed after the RT calls of this study were stored; these calls are used again. If the "
+                "%s: %s changed after the RT calls of this study were stored; the stored calls are used again. If the "
                 "change affects their answers, use another folder, or delete the ledger",
                 self._ledger.path, ", ".join(changed),
             )  # fmt: skip
 
     def _from_ledger(self, missing: dict[bytes, list[int]]) -> Iterator[Answer]:
-        """Yield the answers in the ledger, and remove their candidates from `missing`."""
+        """Yield the answers that are in the ledger, and remove their candidates from `missing`."""
         for candidate in list(missing):
             entry = self._ledger.find(self._problem, candidate, self._engine.num_links)
             if entry is not None:
@@ -184,7 +185,7 @@ class Recorded:
                 try:
                     entry = self._ledger.commit(self._problem, candidate, entry)
                 except (EngineError, KeyboardInterrupt) as error:
-                    # Collect the answers of calls in progress before the run ends, so that they are not lost.
+                    # Before the run ends, collect the answers of calls in progress, so that these answers are not lost.
                     stop.set()
                     unsaved = [(candidate, entry)]
                     with suppress(EngineError):
@@ -197,7 +198,7 @@ class Recorded:
                         raise
                     rescued = self._ledger.rescue(self._problem, self._name, self.parameters.names, unsaved)
                     raise EngineError(f"{error}. {rescued}") from None
-                # The candidate itself is an RT call; its repeats in the batch are not.
+                # The candidate itself required an RT call; its repeats in the batch did not.
                 self.hits += len(indices[candidate]) - 1
                 yield from (_answer(index, entry) for index in indices[candidate])
 

@@ -1,1 +1,1 @@
-"""Ray tables: the paths of any engine, read into a path program and written from one."""
+"""Ray tables: the paths of any engine, read into a path program or written from a path program."""

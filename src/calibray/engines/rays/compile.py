@@ -1,7 +1,8 @@
 """Convert a ray table to a path program, with checks and a correction for every path, and back.
 
-The correction is the power that the engine states divided by the power of the replay. It accounts for properties that
-only the engine models, such as its antennas. At other constants, the replayed power is multiplied by the correction.
+The correction is the power stated by the engine divided by the power in replay. The correction accounts for properties
+that only the engine models, such as its antennas. At other constants, the replayed power is multiplied by the
+correction.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""Antenna assumed at an end with an unknown antenna. Its two ports cover every polarization, and the correction
-accounts for the gain of the real antenna.
+"""Antenna assumed at an end whose antenna is unknown. The two ports of this antenna cover every polarization, and the
+correction accounts for the gain of the real antenna.
 """
 
 FREE_SPACE_DB: Final = 1.0
-"""Largest deviation of a direct path from free-space power if the antennas are known [dB]. Pattern tables of engines
+"""Maximum deviation of a direct path from free-space power if the antennas are known [dB]. Pattern tables of engines
 differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes errors of tens of
 decibels.
 """
 
 DIRECT_GAIN_DB: Final = 60.0
-"""Largest total gain of both antennas of a direct path [dB], for example two dishes of 30 dBi."""
+"""Maximum total gain of both antennas of a direct path [dB], for example of two dishes with 30 dBi each."""
 
 ROUNDING: Final = 1e-12
 """Power relative to free space below which a path is assumed to lie in a null of the antennas. The value corresponds to
@@ -52,7 +53,7 @@ a few rounding errors of a field in single precision, as in Sionna RT.
 """
 
 HIGH_GAIN_DB: Final = 25.0
-"""A warning is issued if the median total gain of unknown antennas exceeds this value in magnitude [dB]. The value
+"""A warning is issued if the magnitude of the median total gain of unknown antennas exceeds this value [dB]. The value
 corresponds to 18 dBi at one end and 7 dBi at the other.
 """
 
@@ -75,7 +76,7 @@ class RaySetting:
 
     @classmethod
     def of(cls, study: OpenedStudy) -> RaySetting:
-        """The setting of a study at its start values; the antennas are unknown if the study does not state them."""
+        """The setting of a study at the start values; the antennas are unknown if the study does not state them."""
         return cls(study.scene, study.radio.frequency, study.known_antennas, study.links)
 
 
@@ -83,7 +84,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     """Compile the paths of a table; paths with zero power are omitted, but their links are kept.
 
     Raises:
-        InputError: The table contradicts the scene, the links or itself, or `links` is None and no path has a power
+        InputError: The table contradicts the scene, the links or itself; or `links` is None, and no path has a power
             above 0.
     """
     scene = setting.scene
@@ -92,7 +93,7 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         raise InputError(f"{table.source}: no path has a power above 0; export the rays of at least one link")
     ends, link, chosen = _assign_links(table, setting.links)
     link = np.where(absent, -1, link)
-    # Paths that belong to no link or have no power have the link index -1; they come first and are left out.
+    # Paths that belong to no link or have no power have the link index -1; these paths come first and are left out.
     order = np.argsort(link, kind="stable")[(link < 0).sum() :]
     table, link = table.take(order), link[order]
     _check_repeats(table, link)
@@ -108,7 +109,8 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
         # Vertices far from the origin are kept in double precision, because single precision would round them.
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
-        # In a null of the antennas, a path may have no power in replay, and only a rounding error in the engine.
+        # In a null of the antennas, a path may have no power in replay and only a rounding error as its power in the
+        # engine.
         replayed = _without_nulls(paths)
         kept = np.flatnonzero((replayed > 0) | (table.power > ROUNDING * _free_space(paths)))
         power, replayed, table, paths = table.power[kept], replayed[kept], table.take(kept), take(paths, kept)
@@ -122,8 +124,8 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     else:
         unknown = "isotropic antennas of both polarizations"
         _LOG.warning(
-            "%s: states no power for its paths, so path loss is computed with the materials of the scene and %s; add "
-            "power_db to use the engine's powers",
+            "%s: the table states no power for its paths, so path loss is computed with the materials of the scene and "
+            "%s; add power_db to use the engine's powers",
             table.source, unknown if setting.antennas is None else "the stated antennas",
         )  # fmt: skip
     return paths if chosen is None else take_links(paths, chosen)
@@ -161,18 +163,18 @@ def powers(paths: Paths) -> NDArray[np.float64]:
 
 
 def _without_nulls(paths: Paths) -> NDArray[np.float64]:
-    """Power gain of every path in replay, with 0 instead of the rounding error in a null of an antenna [P]."""
+    """Power gain of every path in replay [P]; in a null of an antenna, 0 replaces the rounding error."""
     gain = [(np.abs(field) ** 2).sum(axis=2).max(axis=1) for field in (paths.tx_field, paths.rx_field)]
     return np.where(np.minimum(*gain) > ROUNDING, powers(paths), 0.0)
 
 
 def _free_space(paths: Paths) -> NDArray[np.float64]:
-    """Power gain of every path between isotropic antennas without losses at its interactions [P]."""
+    """Power gain of every path between isotropic antennas, without losses at interactions [P]."""
     return (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
 
 
 def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
-    """The paths with normals and materials of their surfaces, and the largest distance from a surface [m]."""
+    """The paths with normals and materials of surfaces, and the largest distance of a point from its surface [m]."""
     present = table.kind != 0
     stops = np.concatenate([table.tx[:, None], table.vertex, table.rx[:, None]], axis=1)
     stops[np.arange(len(stops)), present.sum(axis=1) + 1] = table.rx
@@ -183,7 +185,7 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
     if (used & (length == 0)).any():
         number = int(np.argmax((used & (length == 0)).any(axis=1)))
         raise InputError(
-            f"{table.source}: path {table.path[number]} has the same point twice in succession; remove one"
+            f"{table.source}: path {table.path[number]} has the same point twice in succession; remove one of the two"
         )
     row, step = np.nonzero(present)
     direction = ahead / np.where(length > 0, length, 1)[..., None]
@@ -248,14 +250,15 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
         stated = table.material == name
         if (stated & (index >= 0) & (index != names[name])).any():
             raise InputError(
-                f"{table.source}: states the material {name!r} for an object that has another material in the scene"
+                f"{table.source}: the table states the material {name!r} for an object that has another material in "
+                "the scene"
             )
         index[stated] = names[name]
     return index
 
 
 def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
-    # The bend angle times the length of the shorter segment is the displacement of its end.
+    # The bend angle times the length of the shorter segment is the displacement of the end of this segment.
     bend = np.linalg.norm(hits.leaving - hits.incident, axis=1) * hits.length
     if (transmits & (bend > 4 * TOLERANCE)).any():
         number = int(np.argmax(np.where(transmits, bend, 0)))
@@ -271,12 +274,12 @@ def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
         return
     length = segment.sum(axis=1)
     off = np.abs(table.delay * speed_of_light - length)
-    # Both ends of every segment may be off by the tolerance.
+    # Both ends of every segment may be displaced by the tolerance.
     if (wrong := off > 2 * TOLERANCE * (segment > 0).sum(axis=1) + 1e-4 * length).any():
         worst = int(np.argmax(np.where(wrong, off / length, 0)))
         raise InputError(
             f"{table.source}: path {table.path[worst]} has the delay {table.delay[worst]:.6g} s, but a length of "
-            f"{length[worst]:.6g} m, which takes {length[worst] / speed_of_light:.6g} s ({wrong.sum()} of {len(off)} "
+            f"{length[worst]:.6g} m corresponds to {length[worst] / speed_of_light:.6g} s ({wrong.sum()} of {len(off)} "
             "paths); give the total delay in seconds, not relative to the first path"
         )
 
@@ -284,7 +287,7 @@ def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
 def _assign_links(
     table: RayTable, links: Links | None
 ) -> tuple[LinkPositions, NDArray[np.int64], NDArray[np.int64] | None]:
-    """Ends of distinct links, index of every path's link, and indices of the program's links (None without `links`).
+    """Ends of distinct links, link index of every path, and indices of the program's links (None without `links`).
 
     Paths between positions that are not in `links` have the index -1.
 
@@ -292,7 +295,7 @@ def _assign_links(
         InputError: No path belongs to a link, or the paths of a link have different ends.
     """
     own = np.hstack([table.tx, table.rx])
-    # Without labels, nearly equal positions count as the same; rounding would separate a few of them.
+    # Without labels, nearly equal positions count as one position; rounding would separate a few of these positions.
     label = join_positions(own) if table.link is None else _ranks(table.link)
     _, first, link = np.unique(label, return_index=True, return_inverse=True)
     link = link.reshape(-1)
@@ -309,12 +312,13 @@ def _assign_links(
     if (lost := off > TOLERANCE).any():
         worst = int(np.argmin(np.where(lost, off, np.inf)))
         fault = (
-            f"{table.source}: {lost.sum()} of {len(lost)} paths connect positions other than those of the links, e.g. "
+            f"{table.source}: {lost.sum()} of {len(lost)} paths do not connect the positions of a link, e.g. "
             f"path {table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
         )
         if lost.all():
             raise InputError(
-                f"{fault}; check units [m], and order and signs of x, y and z, or export the rays of the given links"
+                f"{fault}; check the units [m] and the order and signs of x, y and z, or export the rays of the given "
+                "links"
             )
         _LOG.warning("%s; these paths are omitted", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
@@ -330,7 +334,7 @@ def _ranks(label: NDArray) -> NDArray[np.int64]:
 
 
 def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
-    """Refuse two paths of a link with the same types and points, as in merged exports; their powers would be added."""
+    """Refuse repeats of a path in a link, as in merged exports, because the power of the path would be added twice."""
     point = np.round(table.vertex, 3).reshape(len(link), 3 * table.kind.shape[1])
     rows = np.column_stack([link, table.kind, point])
     _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
@@ -351,14 +355,14 @@ def _check_direct(
     `replayed` is the power of every path in replay; None if the antennas are unknown.
 
     Raises:
-        InputError: A direct path has such a power.
+        InputError: A direct path has an implausible power.
     """
     direct = np.diff(paths.first) == 0
     free_space = _free_space(paths)
     known, least = replayed is not None, ROUNDING * free_space
     expected = free_space if replayed is None else replayed
     off = 10 * np.log10(np.maximum(power, least) / np.maximum(expected, least))
-    # In a null, no correction can restore the power.
+    # In a null of an antenna, no correction can restore the power.
     implausible = (np.abs(off) > FREE_SPACE_DB) | (expected == 0) if known else off > DIRECT_GAIN_DB
     wrong = direct & implausible
     if wrong.any():
@@ -367,7 +371,7 @@ def _check_direct(
         what = "with the stated antennas" if known else "between isotropic antennas"
         common = ""
         if np.ptp(off[direct]) < FREE_SPACE_DB and direct.sum() > 1:
-            common = "; all direct paths differ by this amount, e.g. the transmitted power or a cable loss; subtract it"
+            common = "; all direct paths differ by about this amount, e.g. the transmitted power; subtract this amount"
         raise InputError(
             f"{table.source}: path {table.path[worst]}, a direct path, is {abs(off[worst]):.1f} dB {side} free space "
             f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains{common}"
@@ -376,7 +380,7 @@ def _check_direct(
     if direct.any() and abs(typical := float(np.median(off[direct]))) > HIGH_GAIN_DB:
         side, mistake = "above", "received power, an amplitude in dB or path loss"
         if typical < 0:
-            side, mistake = "below", "twice its decibels (20 log10 of the power)"
+            side, mistake = "below", "twice the path gain in dB (20 log10 of the power)"
         _LOG.warning(
             "%s: direct paths are %.0f dB %s free space between isotropic antennas (median): check that power_db is "
             "the path gain, not %s",
@@ -387,7 +391,7 @@ def _check_direct(
 def _correction(
     table: RayTable, paths: Paths, power: NDArray[np.float64], replayed: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Ratio of the stated power to that in replay [P].
+    """Ratio of the stated power of every path to its power in replay [P].
 
     Raises:
         InputError: A path has no power in replay.

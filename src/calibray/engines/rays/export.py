@@ -21,7 +21,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 FAINT: Final = 0.1
-"""Constant added to every path's share of its link's power, so that weak paths keep a small weight."""
+"""Constant that is added to every path's share of its link's power, so that weak paths keep a small weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Export:
     """The rays of one RT call.
 
     Attributes:
-        paths: The rays as a path program; at the scene's constants, its powers equal those of the engine.
+        paths: The rays as a path program, whose powers at the scene's constants equal those of the engine.
         level_db: Power of every path [P], [dB].
     """
 
@@ -53,7 +53,7 @@ class Export:
             InputError: The rays have no power, or contradict the scene or the links.
         """
         if table.power is None:
-            raise InputError(f"{table.source}: states no power for its paths; add power_db")
+            raise InputError(f"{table.source}: the table states no power for its paths; add power_db")
         paths = compile_rays(table, setting)
         return cls(paths, 10 * np.log10(powers(paths)))
 
@@ -73,7 +73,7 @@ class Export:
 
 @final
 class Exporting:
-    """An engine that returns rays, and keeps them so that each candidate requires only one call.
+    """An engine that returns rays, and keeps these rays so that each candidate requires only one call.
 
     Attributes:
         parameters: The parameters whose values a candidate contains.
@@ -109,7 +109,7 @@ class Exporting:
         if (name := key(candidate)) not in self._exports:
             (answer,) = self._engine.answers(check_candidates(candidate[None], len(self.parameters)))
             if answer.failure:
-                # The run ends, so the next run must repeat the call.
+                # The run ends here, and the next run must repeat the call.
                 if isinstance(self._engine, Recorded):
                     self._engine.forget_failures()
                 raise EngineError(

@@ -33,7 +33,7 @@ class Polyline(NamedTuple):
 
     Attributes:
         points: Points from the transmitter to the receiver [n, 3], [m].
-        types: Types of the n - 2 interactions, as in the column `type`.
+        types: Types of the n - 2 interactions, with the values of the column `type`.
         power_db: Path gain [dB].
         delay: Propagation delay [s]; NaN if not stated.
         materials: Names of the materials at the interactions, as in the column `hit_material`; empty if not stated.
@@ -50,7 +50,8 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
     """A ray table of the given paths, in the given order.
 
     Raises:
-        InputError: The list is empty, a power is NaN, or a path does not have two more points than interactions.
+        InputError: The list is empty, a power is NaN, or the number of points of a path does not exceed the number of
+            interactions by two.
     """
     paths = list(paths)
     if not paths:
@@ -110,7 +111,7 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
         raise InputError("rays: these are already Paths of Calibray; use them without read_rays")
     if not isinstance(rays, str | Path):
         raise InputError(
-            f"rays: is a {type(rays).__name__}; must be a DataFrame, a dict with one list per column, the name of a "
+            f"rays: is a {type(rays).__name__}; it must be a DataFrame, a dict with one list per column, the name of a "
             "file or folder, a list of .p2m files, or the Paths of Sionna RT"
         )
     path = Path(rays)
@@ -127,7 +128,7 @@ def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
 
 
 INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "T": "transmission"}
-"""Types of interactions by letter; foliage (F, X) is refused, because it is not a surface with a material."""
+"""Types of interactions by letter; foliage (F, X) is refused, because foliage is not a surface with a material."""
 
 
 INSITE_NAMES: Final = "*.paths.*.p2m"
@@ -135,7 +136,7 @@ INSITE_NAMES: Final = "*.paths.*.p2m"
 
 
 def _insite_files(rays: Any) -> list[Path]:
-    """The files of Wireless InSite that are given by name, in a list or by their folder; empty for other rays."""
+    """The files of Wireless InSite, which are given by name, in a list or by their folder; empty for other rays."""
     if isinstance(rays, str | Path):
         if (path := Path(rays)).is_dir():
             others = is_deepmimo(path) or (path / AODT_FILES[0]).is_file()
@@ -150,9 +151,10 @@ def read_insite(files: Sequence[Path], tx_power_dbm: float | None) -> SourceTabl
     """Read the paths in text files `*.paths.*.p2m` of Remcom Wireless InSite, each with one transmitter.
 
     Lines that begin with # are comments. The first line contains the number of receivers. Each receiver has a line with
-    its index and its number of paths, followed by a line of totals if there are any paths. Each path has a line of nine
-    numbers (index, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]),
-    or of eight numbers without the phase. A line such as Tx-R-D-Rx and a line for each point follow.
+    its index and its number of paths; if it has paths, a line of totals follows. Each path has a line of nine numbers
+    (index, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]), or of
+    eight numbers without the phase. The line of numbers is followed by a line such as Tx-R-D-Rx and by a line for each
+    point.
 
     Raises:
         InputError: The transmitted power is missing, a file does not exist or is malformed, or a path crosses foliage.
@@ -222,8 +224,8 @@ def _insite_numbers(file: Path, line: tuple[int, str], *counts: int) -> list[flo
         values = []
     if len(values) not in counts or not np.isfinite(values).all():
         raise InputError(
-            f"{file}, line {number}: {shortened(text)!r}, must be {' or '.join(map(str, counts))} numbers; this is not "
-            "a paths file of Wireless InSite (project.paths.t001_01.r002.p2m)"
+            f"{file}, line {number}: {shortened(text)!r}; the line must contain {' or '.join(map(str, counts))} "
+            "numbers, so this is not a paths file of Wireless InSite (project.paths.t001_01.r002.p2m)"
         )
     return values
 
@@ -241,7 +243,7 @@ AODT_TYPES: Final = {
 
 
 def read_aodt(folder: Path) -> SourceTable:
-    """Read the first time step with paths from an export folder of NVIDIA's Aerial Omniverse Digital Twin.
+    """Read the first time step that has paths from an export folder of NVIDIA's Aerial Omniverse Digital Twin.
 
     The folder contains two tables, both of which state the time, the radio unit and the user equipment. `raypaths` has
     a row for each path, with its points in units of the scene (centimetres) and its types of interactions. `cirs` has a
@@ -250,7 +252,7 @@ def read_aodt(folder: Path) -> SourceTable:
     Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
 
     Raises:
-        InputError: A table or column is missing or malformed, or the numbers of gains and paths of a pair differ.
+        InputError: A table or column is missing or malformed, or a pair has different numbers of gains and paths.
     """
     rays, gains = (read_table(folder / name) for name in AODT_FILES)
     for table, names in ((rays, ["points", "interaction_types"]), (gains, ["cir_re", "cir_im", "cir_delay"])):
@@ -284,7 +286,7 @@ def read_aodt(folder: Path) -> SourceTable:
 def _aodt_response(
     source: str, pair: Any, rows: Any, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Power and delay of every path of one pair of radio unit and user equipment."""
+    """Power and delay of every path between one radio unit and one user equipment."""
     lists = [
         [_aodt_numbers(source, name, value) for value in rows[name]]
         for name in ("cir_re", "cir_im", "cir_delay")
@@ -300,7 +302,7 @@ def _aodt_response(
 
 
 def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
-    """The numbers of a list with one entry for each path."""
+    """The numbers in a list with one entry for each path."""
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -349,7 +351,7 @@ def _aodt_types(table: SourceTable, types: Any) -> list[str]:
 
 DEEPMIMO_TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", "4": "transmission"}
 DEEPMIMO_OLD_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
-"""Names of matrices in earlier versions, by their present names."""
+"""Names of matrices in earlier versions, by the present names."""
 
 
 def is_deepmimo(folder: Path) -> bool:
@@ -398,7 +400,7 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
             f"{tx.shape} and {rx.shape}; power, delay and inter must be [N, P], inter_pos [N, P, I, 3], tx_pos [1, 3] "
             "and rx_pos [N, 3]"
         )
-    # A path with a delay and interactions counts as existing, so that a power of NaN is refused later.
+    # A path with a delay and interactions counts as a path, so that a power of NaN is refused later.
     exists = np.isfinite(inter) & (inter >= 0) & (np.isfinite(power) | np.isnan(power) & np.isfinite(delay))
     for receiver, path in np.argwhere(exists).tolist():
         codes = str(int(inter[receiver, path])) if inter[receiver, path] else ""
@@ -425,8 +427,8 @@ def _matrix(file: Path) -> NDArray[np.float64]:
             size = 8 * sum(int(np.prod(shape)) for _, shape, _ in whosmat(file))
         if size > LARGEST_ARRAYS:
             raise InputError(
-                f"{file}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20} MiB; export fewer "
-                "receivers"
+                f"{file}: has {size / 2**20:,.0f} MiB; it must have at most {LARGEST_ARRAYS // 2**20} MiB; export "
+                "fewer receivers"
             )
         if file.suffix == ".npz":
             with np.load(file, allow_pickle=False) as packed:
@@ -448,7 +450,7 @@ def is_sionna_paths(value: object) -> bool:
 
 
 def check_carrier(rays: Any, frequency: float) -> None:
-    """Refuse paths of Sionna RT that were solved at a carrier other than `frequency` [Hz]; other rays state no carrier.
+    """Refuse paths of Sionna RT solved at a carrier other than `frequency` [Hz]; other kinds of rays state no carrier.
 
     Raises:
         InputError: The carriers differ.
@@ -459,8 +461,8 @@ def check_carrier(rays: Any, frequency: float) -> None:
     # Sionna RT stores the carrier in single precision.
     if not np.isclose(solved, frequency, rtol=1e-6):
         raise InputError(
-            f"{SIONNA_PATHS}: were solved at {solved / 1e9:g} GHz, must be at {frequency / 1e9:g} GHz, the carrier of "
-            "the study or of the argument frequency; set scene.frequency and solve again"
+            f"{SIONNA_PATHS}: were solved at {solved / 1e9:g} GHz, but must be solved at {frequency / 1e9:g} GHz, the "
+            "carrier of the study or of the argument frequency; set scene.frequency and solve again"
         )
 
 
@@ -470,7 +472,7 @@ def read_sionna_paths(paths: Any) -> SourceTable:
     The shape of vertices and interactions is [D, R, T, P] with synthetic arrays, and otherwise [D, R, Ra, T, Ta, P],
     where Ra and Ta count the antennas of the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
 
-    Powers are summed over the ports of a receiver and averaged over those of a transmitter.
+    Powers are summed over the ports of a receiver and averaged over the ports of a transmitter.
 
     Raises:
         InputError: An array has antennas at several positions, or there is no path.
@@ -487,7 +489,7 @@ def read_sionna_paths(paths: Any) -> SourceTable:
 def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
     from calibray.tracing.sionna.live_scene import (
         materials_of_shapes,
-    )  # takes seconds, and only these paths need it
+    )  # the import takes seconds, and only these paths need it
 
     real, imaginary = (np.array(part, dtype=float) for part in paths.a)
     with np.errstate(divide="ignore"):
@@ -495,7 +497,7 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
     shape = level.shape
     kinds, vertices = np.array(paths.interactions), np.array(paths.vertices, dtype=float)
     objects = np.array(paths.objects)
-    if not paths.synthetic_array:  # ports at one place have the same paths
+    if not paths.synthetic_array:  # ports at one position have the same paths
         kinds, vertices, objects = (each[:, :, 0, :, 0] for each in (kinds, vertices, objects))
     delay = np.array(paths.tau, dtype=float)
     delay = delay if delay.shape == shape else delay[:, 0, :, 0]
@@ -514,6 +516,6 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
 
 
 def _sionna_positions(ends: Any, count: int) -> NDArray[np.float64]:
-    """Positions of the ends [count, 3]; ports at one position are listed consecutively."""
+    """Positions of the ends [count, 3]; Sionna RT lists ports at one position consecutively."""
     positions = np.array(ends, dtype=float).T
     return positions[:: len(positions) // count]

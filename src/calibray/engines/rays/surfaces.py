@@ -15,7 +15,7 @@ from calibray.scenes import Scene
 from calibray.scenes.shapes import read_surface
 
 TOLERANCE: Final = 0.02
-"""Largest distance of an interaction from its surface [m]; rounding to centimetres moves a point by at most 0.009 m."""
+"""Maximum distance of an interaction from its surface [m]; rounding to centimetres moves a point by at most 0.009 m."""
 
 SAME: Final = 1e-3
 """Faces are considered coincident at a point if their distances from the point differ by less than this value [m]."""
@@ -69,14 +69,14 @@ class Surfaces:
         return index[close], face[close], distance[close]
 
     def distance(self, point: NDArray[np.float64], faces: NDArray[np.bool_]) -> float:
-        """Distance of a point [3] from the nearest face in the mask `faces` [F], [m]."""
+        """Distance [m] of a point [3] from the nearest face in the mask `faces` [F]."""
         corners = self.corners[faces]
         nearest = _nearest(corners, np.broadcast_to(point, (len(corners), 3)))
         return float(np.linalg.norm(nearest - point, axis=1).min(initial=np.inf))
 
     def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
         low, high = self.corners.min(axis=1) - within, self.corners.max(axis=1) + within
-        # The points are tested in parts that need about 0.5 GB each.
+        # The points are tested in parts, each of which needs about 0.5 GB.
         size = max(20_000_000 // max(len(low), 1), 1)
         for start in range(0, len(point), size):
             part = point[start : start + size, None]
@@ -99,8 +99,8 @@ class Hits:
         reflects: Whether the law of reflection must hold [n].
         diffracts: Whether an edge diffracts the wave; the edge's faces can have different materials [n].
         material: Index of the stated material; -1 if none is stated [n].
-        preferred: Index of the material that decides where surfaces coincide; -1 if none does [n].
-        label: Names of the interactions in messages [n].
+        preferred: Index of the material that is chosen where surfaces coincide; -1 if no material is preferred [n].
+        label: Names that messages use for the interactions [n].
     """
 
     point: NDArray[np.float64]
@@ -114,7 +114,7 @@ class Hits:
     label: NDArray[np.str_]
 
     def mirror_error(self, index: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance of the path from the ray reflected at normals [k, 3], at the end of the shorter segment [k], [m]."""
+        """Distance of the path from a ray reflected at normals [k, 3], at the end of the shorter segment [k], [m]."""
         incident = self.incident[index]
         mirrored = incident - 2 * np.sum(incident * normal, axis=1)[:, None] * normal
         return np.linalg.norm(mirrored - self.leaving[index], axis=1) * self.length[index]
@@ -123,13 +123,13 @@ class Hits:
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
     """Index of every interaction's face [n], and the largest distance of an interaction from its face [m].
 
-    A reflection is assigned to the nearest face at which it obeys the law of reflection. Any other interaction is
+    A reflection is assigned to the nearest face at which the path obeys the law of reflection. Any other interaction is
     assigned to the nearest face. Except for diffractions, the face must have the stated material. `names` contains the
     names of the materials.
 
     Raises:
-        InputError: A point is not on a surface (of its material), faces of different materials coincide at a point, or
-            no surface reflects the wave in the direction of the path.
+        InputError: A point is not on a surface (of the stated material), faces of different materials coincide at a
+            point, or no surface reflects the wave in the direction of the path.
     """
     index, face, distance = surfaces.near(hits.point, TOLERANCE)
     free = (hits.material < 0) | hits.diffracts
@@ -151,9 +151,9 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     if bent[first].any():
         worst = int(np.argmax(np.where(bent[first], error[order][first], 0)))
         raise InputError(
-            f"{hits.label[worst]}: is not a reflection from the surface of "
-            f"{names[surfaces.material[face[first[worst]]]]!r} there: it violates the law of reflection by "
-            f"{error[order][first[worst]]:.3g} m; export the vertices with more digits, or correct its type"
+            f"{hits.label[worst]}: cannot be a reflection from the surface of "
+            f"{names[surfaces.material[face[first[worst]]]]!r}, because the path violates the law of reflection by "
+            f"{error[order][first[worst]]:.3g} m; export the vertices with more digits, or correct the type"
         )
     _refuse_ambiguous(surfaces, hits, (index, face, distance, bent), first, names)
     return face[first], float(distance[first].max(initial=0.0))
@@ -167,8 +167,8 @@ def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names:
     surface = "surface of the scene" if stated < 0 else f"surface of {names[stated]!r}"
     return InputError(
         f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface} "
-        f"but must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check units [m], "
-        "order and signs of x, y and z, scene and material"
+        f"but must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check the units "
+        "[m], the order and signs of x, y and z, the scene and the material"
     )
 
 
@@ -185,8 +185,8 @@ def _refuse_ambiguous(
         pair = int(np.argmax(rival))
         raise InputError(
             f"{hits.label[index[pair]]}: surfaces of {names[material[best[pair]]]!r} and {names[material[pair]]!r} "
-            "coincide there; state the material in the column material of the table (paths of Sionna RT state it while "
-            "their scene is in memory)"
+            "coincide at this point; state the material in the column material of the table (paths of Sionna RT state "
+            "the material while their scene is in memory)"
         )
 
 
@@ -223,12 +223,13 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
             f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path there; "
             "check the vertex, or remove the path"
         )
-    # Among pairs with equal errors, the pair whose 0-face the wave meets most nearly head-on is used.
+    # Among pairs with equal errors, the pair is used whose 0-face the wave meets at the angle closest to normal
+    # incidence.
     return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(hits.incident[number], edge.normal_0)))
 
 
 def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -> Edge | None:
-    """The wedge of a 0-face and an n-face; None if they form no wedge around which the path bends."""
+    """The wedge of a 0-face and an n-face; None if the faces form no wedge around which the path bends."""
     point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
     normal_0, normal_n = surfaces.normal[list(faces)]
     direction = np.cross(normal_0, normal_n)
@@ -242,7 +243,7 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
     direction /= np.linalg.norm(direction)
     # Sionna RT measures azimuths from the tangent n_0 x e, which points into the 0-face.
     direction *= np.sign(np.dot(np.cross(normal_0, direction), into_0))
-    # A ray behind both faces runs within the wedge; the wave must meet the 0-face from outside.
+    # A ray behind both faces runs inside the wedge, but the wave must meet the 0-face from outside.
     inside = [np.dot(end, normal_0) < 0 and np.dot(end, normal_n) < 0 for end in (-incident, leaving)]
     if any(inside) or np.dot(incident, normal_0) > 0 or not direction.any():
         return None
@@ -252,7 +253,9 @@ def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -
 
 
 def _nearest(corners: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points [k, 3] of triangles with corners [k, 3, 3] that are nearest to points [k, 3], [m]."""
-    from trimesh.triangles import closest_point  # takes 0.2 s, and only rays of other programs need it
+    """For each point [k, 3], the nearest point [k, 3] of a triangle with corners [k, 3, 3], [m]."""
+    from trimesh.triangles import (
+        closest_point,
+    )  # the import takes 0.2 s, and only rays of other programs need it
 
     return closest_point(corners, point)

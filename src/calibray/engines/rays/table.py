@@ -1,7 +1,7 @@
 """A ray table: one row for each point of a path, from the transmitter via the interactions to the receiver.
 
-`docs/reference/ray-table.md` documents the columns. Rows can be in any order, because every row states its path and its
-position on the path. Files are in CSV, Parquet, JSON or HDF5, depending on their extension.
+`docs/reference/ray-table.md` documents the columns. Rows can be in any order, because every row states its path and the
+number of its point on the path. The file extension determines the format: CSV, Parquet, JSON or HDF5.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ ENDS: Final = ("transmitter", "receiver")
 REQUIRED: Final = ("path", "point", "type", "x", "y", "z")
 POWERS: Final = ("power_db", "gain_real", "gain_imag")
 OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
-"""Optional columns of a table; unknown names are compared with these, because a misspelt name would be ignored."""
+"""Optional columns of a table; unknown names are compared with these columns, because a misspelt name would be
+ignored."""
 
 HIT_MATERIAL: Final = "hit_material"
-"""Optional column like `material`, used only where surfaces of different materials coincide."""
+"""Optional column like `material`, which is used only where surfaces of different materials coincide."""
 
 QUANTITIES: Final = {
     "gain_real": r"\b(re|real)\b",
@@ -53,24 +54,26 @@ QUANTITIES: Final = {
     "delay": "delay",
     "material": "material",
 }
-"""For each column, the pattern of unknown names that probably refer to it; separators in a name are read as blanks."""
+"""For each column, the pattern of unknown names that probably refer to this column; separators in a name are read as
+blanks."""
 
 MISSPELT: Final = 0.8
-"""Smallest similarity at which an unknown column is considered misspelt; `line` is not considered a misspelt `link`."""
+"""Minimum similarity at which an unknown name is considered a misspelt column; `line` is not considered a misspelt
+`link`."""
 
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
-"""Largest number of points of a path: the largest number of interactions of a trace, plus both ends."""
+"""Maximum number of points of a path: the maximum number of interactions in a trace, plus both ends."""
 
 NO_POWER: Final = {"power_db": "-inf (-10000 in JSON)", "gain_real": "0", "gain_imag": "0"}
 """Values in these columns for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
-"""Level used instead of -inf [dB]; the corresponding power is 0 in double precision."""
+"""Level that replaces -inf [dB]; the corresponding power is 0 in double precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class RayTable:
-    """Paths of an engine: P paths, padded to the largest depth D, in the order of their labels.
+    """The P paths of an engine, padded to the largest depth D and sorted by their labels.
 
     Attributes:
         source: Name of the table, for messages.
@@ -79,11 +82,11 @@ class RayTable:
         tx: Transmitter position of every path [P, 3], [m].
         rx: Receiver position of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        kind: Kinds of interaction, 0 beyond the last one [P, D].
+        kind: Kinds of interaction [P, D]; 0 after the last interaction.
         material: Names of materials, empty where not stated [P, D].
         object: Names of objects, empty where not stated [P, D].
         hit_material: Names of materials, used only where surfaces coincide; empty where not stated [P, D].
-        power: Path gain [P], 0 for an absent path; None if not stated.
+        power: Path gain [P]; 0 for an absent path, None if not stated.
         delay: Propagation delay [P], [s]; None if not stated.
     """
 
@@ -193,7 +196,7 @@ def _checked_rows(table: SourceTable) -> SourceTable:
 
 
 def _with_known_names(table: SourceTable) -> SourceTable:
-    """The table with the documented names of its known columns; names that seem to be misspelt are refused."""
+    """The table with the documented names of its known columns; names that appear to be misspelt are refused."""
     known = (*REQUIRED, *OPTIONAL, HIT_MATERIAL)
     given = [str(name) for name in table.frame]
     names = [name if (name := _plain(text)) in known else text for text in given]
@@ -233,7 +236,7 @@ def _meant(name: str, absent: set[str]) -> str | None:
 def _kinds(
     table: SourceTable, row_path: NDArray[np.int64], step: NDArray[np.int64], count: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Kind of every row, 0 at the ends [rows]; unknown types and paths without their ends are refused."""
+    """Kind of every row [rows], 0 at the ends of a path; unknown types and paths without both ends are refused."""
     stated = table.labels("type")
     kinds = np.char.lower(np.char.strip(stated))
     known = [*ENDS, *TYPES]
@@ -245,7 +248,7 @@ def _kinds(
     if (shared := np.minimum(sources, targets) > 1).any():
         row = int(np.argmax(shared[row_path]))
         raise InputError(
-            f"{table.cell(row, 'path')}: {table.frame['path'].iloc[row]} is the number of several paths "
+            f"{table.cell(row, 'path')}: {table.frame['path'].iloc[row]} is the number of more than one path "
             f"({sources[row_path[row]]} transmitters); numbers must be unique in the table, even across links: "
             "renumber all paths, or remove repeated rows"
         )
@@ -257,8 +260,8 @@ def _kinds(
         row = int(np.argmax(wrong))
         raise InputError(
             f"{table.cell(row, 'type')}: {str(kinds[row])!r} at point {step[row]} of {count[row_path[row]]} of its "
-            f"path; the first point of a path is its transmitter and the last its receiver, with at most "
-            f"{MOST_POINTS - 2} interactions between them"
+            f"path; the first point of a path must be the transmitter and the last point the receiver, with at most "
+            f"{MOST_POINTS - 2} interactions between the two"
         )
     codes = {**dict.fromkeys(ENDS, 0), **TYPES}
     return np.array([codes[name] for name in kinds.tolist()], dtype=np.int64)
@@ -291,11 +294,11 @@ def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
 
 
 def _names(table: SourceTable, name: str) -> NDArray:
-    """Values of a column as integers if possible, so that they sort as numbers, and otherwise as labels [rows]."""
+    """Values of a column [rows]: integers if possible, which sort as numbers, and otherwise labels."""
     column = table.column(name)
     if pd.api.types.is_integer_dtype(column) and not column.isna().any():
         return column.to_numpy()
-    # Whole numbers are floats in MATLAB, and in pandas if any row is empty.
+    # MATLAB stores whole numbers as floats, and pandas does so if any row is empty.
     if pd.api.types.is_float_dtype(column) and ((column % 1 == 0) & (column.abs() < 2**53)).all():
         return table.numbers(name).astype(np.int64)
     return table.labels(name)
@@ -308,7 +311,7 @@ def _per_path(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> NDA
 
 
 def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Series:
-    """A value that applies to the whole path, and must be the same in all rows that state it [P]."""
+    """A value for the whole path, which must be the same in all rows that state the value [P]."""
     groups = table.column(name).groupby(row_path)
     number = groups.nunique().to_numpy()
     row = int(np.argmax((number != 1)[row_path]))
@@ -319,7 +322,7 @@ def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Se
         )
     if number[row_path[row]] > 1:
         raise InputError(
-            f"{table.cell(row, name)}: all rows of a path must state the same {name}; correct them"
+            f"{table.cell(row, name)}: all rows of a path must state the same {name}; correct these rows"
         )
     return groups.first()
 
@@ -329,7 +332,7 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
     gains = [name for name in ("gain_real", "gain_imag") if name in table.frame]
     if "power_db" in table.frame:
         if gains:
-            raise InputError(f"{table.source}: has both power_db and {gains[0]}; remove one")
+            raise InputError(f"{table.source}: has both power_db and {gains[0]}; remove one of them")
         finite = table.column("power_db").replace(-np.inf, POWER_ZERO_DB)
         level = _per_path(table.assign(power_db=finite), "power_db", row_path)
         if (level > 0).any():
@@ -351,13 +354,13 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
 
 
 LARGEST_JSON: Final = 2**26
-"""Largest JSON file [bytes]; in memory, its numbers occupy about twenty times as much."""
+"""Maximum size of a JSON file [bytes]; in memory, the numbers occupy about twenty times as much."""
 
 HDF5: Final = b"\x89HDF"
 """First bytes of an HDF5 file."""
 
 LARGEST_ARRAYS: Final = 2**30
-"""Largest size of datasets or matrices in memory [bytes]; a limit is needed because kilobytes can unpack to gigabytes.
+"""Maximum size of datasets or matrices in memory [bytes]; a limit is needed because kilobytes can unpack to gigabytes.
 """
 
 
@@ -377,7 +380,7 @@ def read_ray_file(file: str | Path) -> SourceTable:
         return _parsed(path, str(path))
     if (size := path.stat().st_size) > LARGEST_JSON:
         raise InputError(
-            f"{path}: {size / 2**20:,.0f} MiB of JSON, must be at most {LARGEST_JSON // 2**20} MiB; write "
+            f"{path}: has {size / 2**20:,.0f} MiB of JSON; it must have at most {LARGEST_JSON // 2**20} MiB; write "
             ".parquet or .h5"
         )
     return parse_rays(path.read_bytes(), str(path))
@@ -394,7 +397,7 @@ def parse_rays(content: bytes, source: str) -> SourceTable:
     text = content.decode("utf-8-sig", "replace")
     header = text.lstrip().partition("\n")[0].strip()
     if re.match(r"[^\[{]*[,;\t]", header):
-        raise InputError(f"{source}: begins with {shortened(header)!r}; must be JSON or HDF5, not CSV")
+        raise InputError(f"{source}: begins with {shortened(header)!r}; it must be JSON or HDF5, not CSV")
     return _parsed(text, source)
 
 
@@ -423,7 +426,7 @@ def _parsed(content: Path | BytesIO | str | Mapping[Any, Any], source: str) -> S
 
 
 def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = False) -> None:
-    """Write the rows as .csv, .parquet, .json or .h5; an existing file is replaced only once the new one is complete.
+    """Write the rows as .csv, .parquet, .json or .h5; an existing file is replaced only once the new file is complete.
 
     Raises:
         InputError: The file extension is unknown, or the file cannot be written or must not be replaced.
@@ -475,12 +478,12 @@ def _read_hdf5(content: Path | BytesIO, source: str) -> pd.DataFrame:
         for name, item in columns.items():
             if item.is_virtual or item.external is not None:
                 raise InputError(
-                    f"{source}: {shortened(name)!r} is stored in another file; store it in this one"
+                    f"{source}: {shortened(name)!r} is stored in another file; store it in this file"
                 )
         if (size := sum(item.nbytes for item in columns.values())) > LARGEST_ARRAYS:
             raise InputError(
-                f"{source}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_ARRAYS // 2**20} MiB; export fewer "
-                "links"
+                f"{source}: has {size / 2**20:,.0f} MiB; it must have at most {LARGEST_ARRAYS // 2**20} MiB; export "
+                "fewer links"
             )
         # MATLAB writes a vector as a matrix with one row or column.
         return pd.DataFrame(
