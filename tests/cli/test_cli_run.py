@@ -267,7 +267,7 @@ def test_a_model_that_predictions_do_not_use_yet_is_named(folder, ran, tmp_path)
         (("run", "{study}", "--out", "{out}", "--engine", "replya"), "engine"),
         (("run", "{folder}/absent.toml", "--out", "{out}"), "absent.toml: no such study file"),
         (("trace", "{study}", "-o", "{folder}/absent/paths.h5"), "there is no folder"),
-        (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
+        (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in this folder"),
         (("trace", "{study}"), "trace: give -o FILE to store the paths, --check to check them, or both"),
         (("validate", "{study}", "--out", "{damaged}"), "result.json: is not a result"),
         (("predict", "{folder}", "{file}"), "is not a result written by `calibray run`"),

@@ -253,7 +253,7 @@ def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Pa
         with pytest.raises(EngineError, match=message):
             cb.calibrate(cb.Study.load(study))
     program.write_text(correct.replace("json.dump", "(lambda *answer: None)"))
-    with pytest.raises(EngineError, match="the response: not a ray table"):
+    with pytest.raises(EngineError, match="the response: is not a ray table"):
         cb.engines.make(cb.Study.load(study)).path_loss(np.array([[TRUTH]]))
     content = cb.Study.load(study).content()
     with pytest.raises(InputError, match=r"engine\.rays = true.*combining = 'coherent'"):

@@ -114,8 +114,11 @@ def test_answers_that_can_be_read(tmp_path, content, num_links, loss):
         ('{"path_loss_db": [70, 8', "not JSON"),
         ("[70, 80]", "no key 'path_loss_db'"),
         ('{"path_loss": [70, 80]}', "no key 'path_loss_db'$"),
-        ('{"path": [0, 0], "point": [0, 1]}', r"no key 'path_loss_db'; it is a ray table: set rays = true"),
-        ('[{"path": 0, "point": 0}]', r"no key 'path_loss_db'; it is a ray table: set rays = true"),
+        (
+            '{"path": [0, 0], "point": [0, 1]}',
+            r"no key 'path_loss_db'; the response is a ray table: set rays = true",
+        ),
+        ('[{"path": 0, "point": 0}]', r"no key 'path_loss_db'; the response is a ray table: set rays = true"),
         ('{"path_loss_db": [70]}', r"shape \(1,\); it must be \(2,\)"),
         ('{"path_loss_db": [[70, 80]]}', r"contains \[70, 80\] in path_loss_db, which is not a number"),
         ('{"path_loss_db": [70, NaN]}', r"path_loss_db\[1\] = nan; it must be a number"),
@@ -398,8 +401,8 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
                 *("a" * 9999, "a b:1"),
             )
         ),
-        (None, "tls://127.0.0.1:9", "no Dask scheduler answers there"),
-        (None, "tcp://nowhere.invalid:8786", "no Dask scheduler answers there"),
+        (None, "tls://127.0.0.1:9", "no Dask scheduler answers at this address"),
+        (None, "tcp://nowhere.invalid:8786", "no Dask scheduler answers at this address"),
     ],
 )
 def test_executors_that_are_refused(workers, scheduler, message, monkeypatch):

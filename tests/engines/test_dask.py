@@ -126,7 +126,7 @@ def test_a_block_that_is_killed_is_done_again_and_what_is_shared_is_sent(tmp_pat
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr("calibray.engines.cluster.dask_workers.SCHEDULER_WAIT", 0.5)
     with (
-        pytest.raises(InputError, match="no Dask scheduler answers there"),
+        pytest.raises(InputError, match="no Dask scheduler answers at this address"),
         engines.open_workers(scheduler="tcp://127.0.0.1:9"),
     ):
         pass

@@ -106,7 +106,7 @@ def test_a_damaged_entry_is_dropped_with_a_line_and_asked_again(path, caplog, ch
     assert resumed(path) == 2  # the damaged one, and one that was never run
     (record,) = caplog.records
     assert record.message.startswith(f"{path}: call 2 is damaged ({message}")
-    assert record.message.endswith("; it is deleted and run again")
+    assert record.message.endswith("; the call is deleted and run again")
     assert resumed(path) == 0
 
 
@@ -178,7 +178,7 @@ def test_malformed_pages_are_refused_with_place_and_remedy(path, seed):
         content[page * 4096 : page * 4096 + 64] = rng.bytes(64)
     path.write_bytes(content)
     with pytest.raises(
-        InputError, match=r"ledger.sqlite: cannot be used.*(malformed|disk image).*move it away"
+        InputError, match=r"ledger.sqlite: cannot be used.*(malformed|disk image).*move the ledger away"
     ):
         Ledger(path)
 
@@ -193,7 +193,7 @@ def test_a_lock_that_is_held_for_long_costs_nothing(path, monkeypatch):
         ):
             engine.path_loss(CANDIDATES)
         assert engine.calls == 0
-        with pytest.raises(InputError, match=r"has locked it for 0.2 s: end that"):
+        with pytest.raises(InputError, match=r"has locked the ledger for 0.2 s: end that"):
             Ledger(path)
         other.execute("ROLLBACK")
         assert engine.path_loss(CANDIDATES).tolist() == LOSSES
@@ -235,7 +235,7 @@ def test_an_answer_that_was_paid_for_is_kept_beside_the_ledger_and_taken_up(path
         again = Recorded(Summing(), ledger, "r", "command")
         assert again.path_loss(CANDIDATES).tolist() == LOSSES
     assert again.calls == 1
-    assert "1 answers read from the rescue file" in caplog.text
+    assert "1 answer read from the rescue file" in caplog.text
     assert list(path.parent.glob("ledger-rescue-*")) == []
 
 
@@ -323,7 +323,7 @@ def test_a_damaged_answer_of_a_rescue_file_is_run_again(path, caplog):
     with closing(sqlite3.connect(file)) as connection, connection:
         connection.execute("UPDATE answers SET path_loss_db = ?", (doubles(82.0, np.inf),))
     assert resumed(path) == 1
-    assert "is damaged (a wrong checksum); it is deleted and run again" in caplog.text
+    assert "is damaged (a wrong checksum); the call is deleted and run again" in caplog.text
 
 
 def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):
@@ -334,7 +334,7 @@ def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):
         assert len(ledger.table()) == 2
         engine = Recorded(Summing(), ledger, "p", "command")
         with pytest.raises(
-            InputError, match="cannot be written, and has no answer for 1 candidate; make it and its"
+            InputError, match="cannot be written, and has no answer for 1 candidate; make the ledger and its"
         ):
             engine.path_loss(CANDIDATES)
         assert engine.calls == 0

@@ -220,7 +220,7 @@ WRONG = {
     ),
     "numbers that restart in every link": (
         lambda t: t.assign(path=t.path - t.groupby("link").path.transform("min")),
-        "0 is the number of more than one path .*unique in the table",
+        "several paths have the number 0 .*unique in the table",
     ),
     "no rows": (lambda t: t.iloc[:0], "contains no rows"),
     "nothing": (lambda t: None, "is a NoneType; it must be a DataFrame"),
@@ -478,7 +478,7 @@ def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
     assert np.bincount(paths.link).tolist() == [2, 1, 2, 2, 2, 2, 2, 2]
     np.testing.assert_allclose(path_loss(paths)[2:], path_loss(traced)[2:], atol=1e-5)
     moved = rows.assign(z=rows.z + 0.5 * (rows.type == "receiver"))
-    with pytest.raises(InputError, match=r"paths do not connect the positions of a link.* 0\.5 m away"):
+    with pytest.raises(InputError, match=r"does not connect the positions of a link.* 0\.5 m away"):
         cb.read_rays(moved[moved.path % 2 == 0].assign(delay=np.nan).drop(columns="delay"), study)
 
 

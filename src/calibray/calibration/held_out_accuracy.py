@@ -240,7 +240,7 @@ def fit_fallback(
     if count >= FEW:
         mean_db = float(residuals[usable].mean())
         terms += (FittedTerm(name, CONSTANT, "", {"": mean_db}),)
-        # The error of each link relative to the mean of the others.
+        # The error of each link relative to the mean of the other links.
         errors = (residuals[usable] - mean_db) * count / (count - 1)
         basis = f"errors of {count} links {name}"
     elif len(held_out_db) >= FEW:

@@ -63,7 +63,7 @@ class LinkDiagnostics:
 
 
 def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> LinkDiagnostics:
-    """Compute diagnostics of the links at calibrated values [d]; columns that the engine cannot provide are omitted.
+    """Compute link diagnostics at the calibrated values [d]; columns that the engine cannot provide are omitted.
 
     `paths` are the calibration's paths at the study's carrier, if available.
     """
@@ -180,14 +180,15 @@ def _chunk_power(chunk: Chunk, materials: dict[str, Material]) -> _Power:
 
 
 FEWEST_CLUSTERS: Final = 8
-"""Minimum number of clusters with links both inside and outside a group; a group with fewer is not tested."""
+"""Minimum number of clusters with links both inside and outside a group; a group with fewer such clusters is not
+tested."""
 
 MIXED: Final = 0.5
 """Minimum share of the variance of group membership within clusters for a group to be tested; a group with a smaller
 share is a location."""
 
 SIGNIFICANCE: Final = 0.01
-"""Probability of a false alarm about any group of any column, or about any antenna direction."""
+"""Probability of a false alarm over all groups of all columns, or over all antenna directions."""
 
 SMALLEST_DB: Final = 0.05
 """Minimum improvement of the RMSE for which a group or a direction is reported [dB]; smaller improvements do not change
@@ -217,7 +218,7 @@ class Difference:
 def differing_groups(
     residual_db: NDArray[np.float64], ends: NDArray[np.float64], columns: Mapping[str, NDArray[np.str_]]
 ) -> list[Difference]:
-    """Find groups of links, such as those of one device, whose residuals differ significantly from those of neighbours.
+    """Find groups, such as the links of one device, whose residuals differ significantly from residuals of neighbours.
 
     Only neighbouring links of one transmitter are compared: residuals and group membership are taken relative to their
     means over clusters of neighbouring links. A column that is constant over a neighbourhood, such as the name of a
@@ -318,7 +319,7 @@ MOST_NUMBERS: Final = 12
 """Maximum number of distinct values in a numeric column, such as days or floors, whose values can label groups."""
 
 SIGNAL_CORRELATION: Final = 0.5
-"""Magnitude of the rank correlation with path loss above which whole numbers are taken for signal levels, not
+"""Magnitude of the rank correlation with path loss above which whole numbers are assumed to be signal levels, not
 labels."""
 
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
@@ -365,7 +366,7 @@ def _excess_db(problem: Problem, trail: Trail) -> NDArray[np.float64]:
 def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
     """Test whether the groups of a column without a nuisance, such as devices, explain the residuals of a calibration.
 
-    Labels are text, carriers, or a few whole numbers. Numbers that correlate with path loss are taken for signal
+    Labels are text, carriers, or a few whole numbers. Numbers that correlate with path loss are assumed to be signal
     levels.
     """
     setup, links = problem.setup, problem.setup.links
@@ -412,7 +413,7 @@ def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
 
 
 def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Test whether transmit antenna directions other than the stated ones would explain the residuals.
+    """Test whether transmit antenna directions other than the stated directions would explain the residuals.
 
     For each transmitter, an F test adds two columns to a model with the parameters, the nuisance and a gain of the
     transmitter. These columns are the derivatives of path loss with respect to azimuth and downtilt at the calibrated

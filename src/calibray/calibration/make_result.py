@@ -1,4 +1,4 @@
-"""Make the result of a finished run: its accuracy and that of baselines, intervals, and a row for every link."""
+"""Make the result of a finished run: its accuracy, the accuracy of baselines, intervals, and a row for every link."""
 
 from __future__ import annotations
 
@@ -268,7 +268,7 @@ def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float
 
 
 def _worse_than_mean(problem: Problem, found_db: float, log_distance_db: float) -> tuple[Remark, ...]:
-    """A remark if the calibrated model fits worse than the mean measured path loss, as when links are mixed up."""
+    """A remark if the calibrated model fits worse than the mean measured path loss, e.g. if links are mixed up."""
     objective = problem.objective
     mean = np.average(objective.measured, weights=objective.weight)
     mean_db = rmse_of(problem, np.full(problem.num_links, mean), objective.weight > 0)

@@ -41,7 +41,7 @@ class Result(Record):
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
-        """Read a result that `save` wrote; with `allow_changed_inputs`, also one whose files were edited.
+        """Read a result that `save` wrote; with `allow_changed_inputs`, also a result whose files were edited.
 
         Raises:
             InputError: The folder contains no result, or the result was written by another version, is damaged, or was

@@ -1,7 +1,7 @@
 """Engines compute the path loss of candidates.
 
 - `Replay` evaluates stored paths and their derivatives in microseconds to milliseconds per candidate.
-- `ReplayCarriers` does the same at several carriers.
+- `ReplayCarriers` evaluates stored paths at several carriers.
 - `ChunkedReplay` replays chunks of links in this process or on workers, and can return sums over links instead of one
   value per link.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.

@@ -128,7 +128,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """A program without the weakest paths of every link, which together carry at most `share` of the link's power.
+    """Omit the weakest paths of every link, which together carry at most `share` of the link's power.
 
     The power shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry at most
     `share` of the power at each of these candidates. The returned program is valid for sums of powers. Raises

@@ -43,7 +43,7 @@ def make(
         ledger: SQLite file that stores RT calls. Replay does not use the ledger, because replaying is faster than
             reading the file.
         workers: Workers that run the calls of a batch ("command") or hold chunks of links ("replay").
-        paths: Paths of the study's links for "replay"; if None, they are traced or read from the cache.
+        paths: Paths of the study's links for "replay"; if None, the paths are traced or read from the cache.
 
     Returns:
         The engine, for all links of the study, including held-out links.

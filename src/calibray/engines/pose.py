@@ -56,7 +56,7 @@ class PoseError:
         mounted: Index of every path's pose [P].
         of_antenna: Indices of the paths of each antenna.
         transmitter: Index of every pose's transmitter [M].
-        weights: Changes in the yaw [rad], downtilt [rad] and gain [dB] of every transmitter per unit of each of e
+        weights: Changes in the yaw [rad], downtilt [rad] and gain [dB] of every transmitter per unit of each of the e
             effect parameters [3, T, e].
         antennas: The distinct antennas.
         gains: Content of the antennas as text, which triggers a new compilation if a gain file changes but keeps its

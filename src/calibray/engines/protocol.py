@@ -155,7 +155,8 @@ class Chunked(Differentiable, Protocol):
     def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Call a picklable function for every chunk on its worker, and return the results in the order of the chunks.
 
-        The first argument is the chunk (`engines.cluster.chunks.Chunk`); the others are the same for all chunks.
+        The first argument is the chunk (`engines.cluster.chunks.Chunk`); the other arguments are the same for all
+        chunks.
         """
         ...
 
@@ -208,10 +209,11 @@ class Answer:
 
 @runtime_checkable
 class Answering(Engine, Protocol):
-    """An engine with expensive calls, which returns each answer of a batch as soon as it arrives.
+    """An engine with expensive calls, which returns each answer of a batch as soon as the answer arrives.
 
-    Its `path_loss` is +inf for all links of a failed candidate. It raises EngineError if every candidate of the first
-    batch fails, too many successive calls fail, or the ledger or a call's files cannot be written.
+    The method `path_loss` returns +inf for all links of a failed candidate. The method raises EngineError if every
+    candidate of the first batch fails, if too many successive calls fail, or if the ledger or the files of a call
+    cannot be written.
     """
 
     @property
@@ -228,7 +230,7 @@ class Answering(Engine, Protocol):
         Raises:
             InputError: A value is unphysical.
             EngineError: Too many successive calls failed, or a call's files cannot be written; all earlier answers were
-                returned.
+                yielded.
         """
         ...
 

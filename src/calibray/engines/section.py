@@ -120,7 +120,7 @@ class OpenedStudy(Protocol):
         ...
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects other than materials on the paths of the given links; all links if None."""
+        """Effects other than materials on the paths of the given links; None stands for all links."""
         ...
 
     def at(self, links: Measurements) -> Self:
@@ -141,7 +141,7 @@ class Openable(Protocol):
 
 
 class EngineSection(Section, ABC):
-    """``[engine]``: the engine that computes the path loss of candidates; `name` states its kind.
+    """``[engine]``: the engine that computes the path loss of candidates; `name` states the kind of engine.
 
     To add a kind of engine, write one final subclass in a separate module in `engines.kinds`; the subclass is found
     automatically. The fields of the class are the keys of the section in the study file, and `name` is a literal. Put
@@ -149,7 +149,7 @@ class EngineSection(Section, ABC):
 
     Attributes:
         name: The name of the kind in study files.
-        expensive: Whether a call takes longer than reading a stored answer; a ledger then stores the calls.
+        expensive: Whether a call takes longer than reading a stored answer; if so, a ledger stores the calls.
         external: Whether an external program computes the answers and no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
     """

@@ -3,9 +3,10 @@
 The field of a path is a Jones vector. Each interaction defines a frame for the Jones vector. The first axis of the
 frame is s = k x n / |k x n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT
 expresses the field in the basis (theta, phi) of the direction of travel. This module combines two rotations: from the
-frame of one interaction into the basis (theta, phi), and from there into the frame of the next interaction. All
-conventions are those of Sionna RT, so path gains also agree in phase. These conventions concern the reference near the
-poles, the orientation of normals and wedges, and the direction after a reflection, which is mirrored instead of traced.
+frame of one interaction into the basis (theta, phi), and from this basis into the frame of the next interaction. All
+conventions are those of Sionna RT, so path gains agree with Sionna RT in phase as well. These conventions concern the
+reference near the poles, the orientation of normals and wedges, and the direction after a reflection, for which the
+mirrored direction is used instead of the traced direction.
 """
 
 from __future__ import annotations
@@ -107,8 +108,8 @@ def compile_chains(chains: Chains) -> Geometry:
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
     tables: dict[int, list[tuple[NDArray[Any], ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
-    # Solid angle of the ray tube, as in Sionna RT: rays share the sphere equally, and every interaction divides by the
-    # probability with which it was chosen.
+    # Solid angle of the ray tube, as in Sionna RT: rays share the sphere equally, and every interaction divides the
+    # solid angle by the probability with which its kind was chosen.
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     # Path length up to the start of the ray tube; a diffuse reflection starts a new ray tube.
     tube_start = np.zeros(count)
@@ -228,7 +229,7 @@ def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float
 def rotate(
     direction: NDArray[np.float64], current: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(cos, sin) [..., 2] of the angle that rotates the frame of a Jones vector about the direction of travel.
+    """(cos, sin) [..., 2] of the angle by which the frame of a Jones vector is rotated about the direction of travel.
 
     The vector (a, b) becomes (cos a + sin b, -sin a + cos b). `current` and `target` are the first axes of both frames
     [..., 3].
@@ -240,7 +241,8 @@ def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]; the azimuth is 0 near the poles."""
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
-    # Without this threshold, as in `spherical_basis`, rounding errors would give a vertical path an arbitrary azimuth.
+    # The threshold is that of `spherical_basis`; without it, rounding errors would give a vertical path an arbitrary
+    # azimuth.
     return np.stack([np.arctan2(rho, z), np.where(rho < 1e-6, 0.0, np.arctan2(y, x))], axis=-1)
 
 

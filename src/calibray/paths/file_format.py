@@ -128,7 +128,7 @@ OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
 
 
 def write(file: h5py.File, content: Content) -> None:
-    """Write the content of a path file: every dataset of `DATASETS`, and those of `OPTIONAL` that are present."""
+    """Write the content of a path file: all datasets of `DATASETS`, and the datasets of `OPTIONAL` that are present."""
     file.attrs.update({"format": FORMAT, "version": FORMAT_VERSION, "frequency_hz": content.frequency})
     file.attrs.update({f"{_SETTING}{key}": value for key, value in content.settings.items()})
     for name, dataset in (DATASETS | OPTIONAL).items():
@@ -236,7 +236,7 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     for name, dataset in _datasets(arrays):
         expected = tuple(sizes[size] if isinstance(size, str) else size for size in dataset.shape)
         if arrays[name].shape != expected:
-            raise _damaged(f"dataset {name} has the shape {arrays[name].shape}; it must be {expected}")
+            raise _damaged(f"dataset {name} has the shape {arrays[name].shape}; the shape must be {expected}")
 
 
 def _check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -293,7 +293,7 @@ def seal(path: str | Path) -> None:
             start = BLOCK if head.startswith(PATH_SEAL) or not any(head) else 0
             file.seek(start)
             if not file.read(len(_SIGNATURE)) == _SIGNATURE:
-                raise InputError(f"{target}: not an HDF5 file; only path files can be sealed")
+                raise InputError(f"{target}: is not an HDF5 file; only path files can be sealed")
             with replacing(target) as partial, partial.open("wb") as sealed:
                 file.seek(start)
                 sealed.write(_block(file))

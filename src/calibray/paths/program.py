@@ -1,9 +1,9 @@
 """The path program: traced paths in a form that allows fields to be evaluated for any materials.
 
-A path is a transmit field, a chain of interactions, and a receive field. An interaction states its material, its kind,
-the cosine of the angle of incidence, and a real rotation from the frame of the previous interaction into its own frame.
-The first axis of each frame is k x n (transverse electric). The first rotation is part of the transmit field, and the
-last rotation is part of the receive field.
+A path is a transmit field, a chain of interactions, and a receive field. An interaction has a material, a kind, a
+cosine of the angle of incidence, and a real rotation from the frame of the previous interaction into its own frame. The
+first axis of each frame is k x n (transverse electric). The first rotation is part of the transmit field, and the last
+rotation is part of the receive field.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Paths:
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        materials: The materials of the trace by name; `material` contains indices into them.
+        materials: The materials of the trace by name, in the order to which the indices in `material` refer.
         tx_position: Transmitter of every link [L, 3], [m].
         rx_position: Receiver of every link [L, 3], [m].
         link: Link of every path [P], non-decreasing.
@@ -54,8 +54,8 @@ class Paths:
         material: Index of the material of every interaction [I].
         cos_incidence: Cosine of the angle of incidence [I].
         rotation: (cos, sin) of the rotation from the previous frame into the frame of the interaction [I, 2].
-        vertex: Points of interaction [I, 3], [m], for plots; in single precision, or in double precision far from the
-            origin. The computed fields do not depend on the points of interaction.
+        vertex: Points of interaction [I, 3], [m], for plots; stored in single precision, or in double precision far
+            from the origin. The computed fields do not depend on the points of interaction.
         diffuse: Additional constants of the diffuse interactions.
         diffraction: Additional constants of the diffractions.
         settings: Settings of the trace, for documentation.

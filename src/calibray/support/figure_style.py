@@ -112,7 +112,7 @@ def write(figure: Figure, path: Path) -> Path:
 def inline(figure: Figure, name: str) -> str:
     """Make an SVG element from a figure; the element takes its colours and font from the surrounding page.
 
-    All ids in the element begin with `name`, and it has no external references.
+    All ids in the element begin with `name`, and the element has no external references.
     """
     written = StringIO()
     figure.patch.set_visible(False)

@@ -82,7 +82,8 @@ def acknowledge_interruption() -> None:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-# Numbers of the signals received within `ensure_interruption`; global, because a process has one handler per signal.
+# Numbers of the signals received within `ensure_interruption`. The list is global, because a process has one handler
+# per signal.
 _pressed: list[int] = []
 
 

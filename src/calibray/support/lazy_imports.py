@@ -27,7 +27,7 @@ def lazy_attributes(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(f"{package}.{homes[name]}")
         value = getattr(module, name) if modules[homes[name]] else module
-        # Stored as an attribute, so that Python does not call this function again for this name.
+        # The value is stored as an attribute, so that Python does not call this function again for this name.
         setattr(sys.modules[package], name, value)
         return value
 

@@ -72,7 +72,7 @@ def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
 @cache
 def _libraries() -> ThreadpoolController:
     """The loaded BLAS libraries, cached because finding them requires reading all memory maps of the process."""
-    # SciPy is imported first, so that its BLAS library is among them.
+    # SciPy is imported first, so that its BLAS library is among the loaded libraries.
     import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
 

@@ -90,7 +90,7 @@ def type_name(value: object) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number followed by a noun, to which an s is added for the plural.
+    """A number followed by a noun; an s is appended to the noun for the plural.
 
     Example:
         >>> counted(1, "link"), counted(1200, "link")
@@ -120,7 +120,7 @@ def percent(share: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a time [s] in seconds, minutes, hours or days, rounded as an estimate.
+    """Format an estimated time [s] as a rounded number of seconds, minutes, hours or days.
 
     Example:
         >>> duration(26_700.0)

@@ -1,8 +1,8 @@
 """Output files, which are checked before any computation starts and are always written completely.
 
-An output never replaces an input, a link or a device. By default, it also never replaces a file that Calibray did not
-write, or that has changed since Calibray wrote it. Calibray signs its files: the file `.calibray` in the same folder
-lists the digest and the name of each file.
+An output never replaces an input, a link or a device. By default, an output also never replaces a file that Calibray
+did not write or that has changed since Calibray wrote it. Calibray signs its files: the file `.calibray` in the same
+folder lists the digest and the name of each file.
 
 `replacing` creates each file under a random name in the same folder, without following links. Once the file is
 complete, it is moved into place in one step.
@@ -35,7 +35,7 @@ STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its
 
 _UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process id
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
-# Windows has neither of the first two flags: links require special privileges there, and folders contain no FIFOs.
+# Windows lacks the first two flags, but links require special privileges on Windows, and folders contain no FIFOs.
 NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
@@ -106,7 +106,7 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
     """
     target = _valid_name(file, "output file")
     if target.is_dir():
-        raise InputError(f"output file {target}: is a folder; name a file in it")
+        raise InputError(f"output file {target}: is a folder; name a file in this folder")
     if not target.parent.is_dir():
         raise InputError(
             f"output file {target}: there is no folder {target.parent}; create it, or choose another folder"
@@ -130,7 +130,7 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
         return
     if stat.S_ISLNK(status.st_mode):
         raise InputError(
-            f"output file {file}: is a symbolic link; give the file to which it points, or another file"
+            f"output file {file}: is a symbolic link; give the file that the link points to, or another file"
         )
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"output file {file}: is a folder, a device or a FIFO; give a file")
@@ -139,8 +139,8 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
             raise InputError(f"output file {file}: is an input; name another file")
     if status.st_size and not overwrite and not is_unchanged_output(file):
         raise InputError(
-            f"output file {file}: was not written by Calibray, or has changed since; name another file, move this one "
-            "away, or give --overwrite"
+            f"output file {file}: was not written by Calibray, or has changed since then; name another file, move this "
+            "file away, or give --overwrite"
         )
 
 
@@ -196,7 +196,7 @@ def _signatures(folder: Path) -> list[str]:
 
 
 def _check_signature_file(folder: Path) -> None:
-    """Refuse a folder with a signature file that Calibray did not write, because files in it could not be signed."""
+    """Refuse a folder whose signature file was not written by Calibray, because files in it could not be signed."""
     # If the signature file cannot be read, writing fails later with the same message as for any other file.
     with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
         pass
@@ -206,8 +206,8 @@ def _open_signatures(folder: Path, flags: int) -> BinaryIO:
     """Open the signature file of a folder with the given flags of `os.open`.
 
     Raises:
-        InputError: The file is a link, a folder or a device; it belongs to another user; it is too large; or another
-            program wrote it.
+        InputError: The file is a link, a folder or a device, belongs to another user, is too large, or was written by
+            another program.
         OSError: The file does not exist or cannot be opened.
     """
     path = folder / SIGNATURES
@@ -232,11 +232,11 @@ def _open_signatures(folder: Path, flags: int) -> BinaryIO:
 
 def _check_signature_status(path: Path, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
-        _refuse_signature_file(path, "it is a link, a folder, a device or a FIFO")
+        _refuse_signature_file(path, "the file is a link, a folder, a device or a FIFO")
     if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
-        _refuse_signature_file(path, "it belongs to another user")
+        _refuse_signature_file(path, "the file belongs to another user")
     if status.st_size > SIGNATURES_LIMIT:
-        _refuse_signature_file(path, f"it has more than {SIGNATURES_LIMIT} bytes")
+        _refuse_signature_file(path, f"the file has more than {SIGNATURES_LIMIT} bytes")
 
 
 def _refuse_signature_file(path: Path, fault: str) -> NoReturn:
@@ -283,7 +283,7 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     removed if writing fails.
 
     Raises:
-        InputError: The file is a link, a device or a folder, Calibray did not write `.calibray`, or another program
+        InputError: The file is a link, a device or a folder; Calibray did not write `.calibray`; or another program
             replaced the temporary file.
     """
     check_replaceable(
@@ -388,7 +388,7 @@ def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool =
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a CSV or Parquet file, without the index, and move it into place, with the errors of `growing_table`."""
+    """Write a CSV or Parquet file without the index and move it into place; see `growing_table` for the errors."""
     with growing_table(path) as append:
         append(table)
 

@@ -148,7 +148,7 @@ def chunk_size(stated: int | None, count: int) -> int:
 
 
 def stated_chunk_size(study: OpenedStudy) -> int | None:
-    """The number of links per chunk stated in a study, or None."""
+    """The number of links per chunk that a study states; None if the study states no number."""
     return getattr(study.engine, "chunk_links", None)
 
 
@@ -238,7 +238,7 @@ class ChunkRecipe:
     Attributes:
         shared: The opened study.
         links: The chunk's links.
-        materials: Materials that replace those of the scene in the trace, by name.
+        materials: Materials by name that replace the scene's materials in the trace.
         open: Opens the engine of the chunk.
     """
 
@@ -288,7 +288,7 @@ class ChunkedReplay:
         study: The opened study.
         chunks: Indices of every chunk's links; every link belongs to exactly one chunk.
         opening: Opens the engine of a chunk; picklable.
-        materials: Materials that replace those of the scene in the trace, by name.
+        materials: Materials by name that replace the scene's materials in the trace.
         progress: Called with "tracing" after every chunk.
 
     Attributes:

@@ -34,7 +34,7 @@ NO_WORKER_WAIT: Final = 600.0
 """Maximum time to wait for a new worker if no worker is left [s]."""
 
 MOST_DEATHS: Final = 4
-"""Number of worker deaths on one chunk after which the run ends, because the chunk is probably too large."""
+"""The run ends after this number of workers died on one chunk, because the chunk is probably too large."""
 
 FETCH_WAIT: Final = POLL
 """Initial time to wait for the transfer of a finished answer [s]. This time doubles with every request, so that large
@@ -42,14 +42,14 @@ answers eventually arrive. Dead workers are detected between requests.
 """
 
 Answered = Callable[[int], None]
-"""Called with a chunk's number after its answer has arrived."""
+"""A function that is called with the number of a chunk after the chunk's answer has arrived."""
 
 
 def count_death(deaths: Counter[int], chunk: int) -> None:
     """Count the death of a worker that died while processing a chunk.
 
     Raises:
-        EngineError: Too many workers died on this chunk.
+        EngineError: Too many workers died while processing this chunk.
     """
     deaths[chunk] += 1
     if deaths[chunk] >= MOST_DEATHS:
@@ -213,9 +213,11 @@ class DaskWorkers:
             if len(living) >= at_least or (living and waited > REPLACEMENT_WAIT):
                 return living
             if waited > NO_WORKER_WAIT:
-                raise EngineError(f"the Dask cluster has had no worker for {NO_WORKER_WAIT:g} s; start one")
+                raise EngineError(
+                    f"the Dask cluster has had no worker for {NO_WORKER_WAIT:g} s; start a worker"
+                )
             if not living and not warned:
-                _LOG.warning("the Dask cluster has no worker; waiting for one")
+                _LOG.warning("the Dask cluster has no worker; waiting for a worker")
                 warned = True
             time.sleep(POLL)
 
@@ -249,7 +251,7 @@ def _wait_for_scheduler(scheduler: str) -> None:
     """Wait until a program answers at an address; without this wait, Dask would log tracebacks.
 
     Raises:
-        InputError: The address is malformed, or nothing answers there.
+        InputError: The address is malformed, or nothing answers at the address.
     """
     match = _ADDRESS.fullmatch(scheduler)
     if match is None or not 1 <= int(match["port"]) <= 65_535:
@@ -273,6 +275,6 @@ def _wait_for_scheduler(scheduler: str) -> None:
 
 def _refuse(scheduler: str, fault: str) -> NoReturn:
     raise InputError(
-        f"--scheduler {shortened(scheduler)}: no Dask scheduler answers there ({shortened(fault, 200)}); start one "
-        "or correct the address"
+        f"--scheduler {shortened(scheduler)}: no Dask scheduler answers at this address ({shortened(fault, 200)}); "
+        "start a scheduler, or correct the address"
     ) from None

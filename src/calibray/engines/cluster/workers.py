@@ -335,10 +335,10 @@ class LocalWorkers:
         return answers
 
     def _replace(self, home: int) -> None:
-        """Start a process to replace a dead one.
+        """Start a process that replaces a dead process.
 
         Raises:
-            EngineError: Too many processes died on the same chunk.
+            EngineError: Too many processes died while processing the same chunk.
         """
         dead = self._workers[home]
         dead.pipe.close()

@@ -258,7 +258,7 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
 def _rays_hint(names: Any) -> str:
     """The remedy if a response with these names is a ray table; otherwise an empty string."""
     is_table = isinstance(names, dict | list) and all(name in names for name in RAY_COLUMNS)
-    return "; it is a ray table: set rays = true in [engine]" if is_table else ""
+    return "; the response is a ray table: set rays = true in [engine]" if is_table else ""
 
 
 def _number(entry: Any, name: str) -> float:

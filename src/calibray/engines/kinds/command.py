@@ -93,9 +93,9 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only its candidate is lost: every link counts as a link without a path. The run ends
-    if every candidate of the first batch fails or if `give_up_after` successive calls fail, because the program is then
-    probably at fault.
+    If all attempts of a call fail, only its candidate is lost: for this candidate, all links count as links without a
+    path. The run ends if every candidate of the first batch fails or if `give_up_after` successive calls fail, because
+    the program is then probably at fault.
 
     Args:
         program: The program, with the settings of its calls.

@@ -74,8 +74,8 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
     A claim is invalid if its process has ended, or has not renewed the claim for a time of `EXPIRY`. `expires` and
     `now` are times [s since 1970] on the clocks of the claim's machine and of this machine.
     """
-    # A clock may be wrong by `SKEW`; a claim whose expiry differs from the present time by more is damaged or
-    # abandoned.
+    # A clock may be wrong by `SKEW`; a claim is damaged or abandoned if its expiry differs by more from the present
+    # time.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
     try:
@@ -239,7 +239,7 @@ def check_own_file(path: Path) -> None:
         if status.st_nlink > 1:
             raise InputError(
                 f"{file}: must be a file with a single name, but has {status.st_nlink} names (hard links); replace "
-                "it with a copy or choose another folder"
+                "the file with a copy, or choose another folder"
             )
 
 
@@ -333,14 +333,15 @@ def explain(error: sqlite3.Error | OSError) -> str:
     """The text of a ledger error, followed by a remedy."""
     # The lowest byte is the kind of error; the others are details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
-    damaged = "move it away and start again, or recover its contents with `sqlite3 FILE .recover`"
+    damaged = "move the ledger away and start again, or recover its contents with `sqlite3 FILE .recover`"
+    end_program = "end that program and start again"
     remedy = {
         sqlite3.SQLITE_FULL: "free disk space and start again",
         sqlite3.SQLITE_IOERR: "free disk space, or repair the disk, and start again",
-        sqlite3.SQLITE_BUSY: f"another program has locked it for {LOCK_WAIT:g} s: end that program and start again",
-        sqlite3.SQLITE_LOCKED: "another program has locked it; end that program and start again",
-        sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
-        sqlite3.SQLITE_CANTOPEN: "make its folder writable and start again",
+        sqlite3.SQLITE_BUSY: f"another program has locked the ledger for {LOCK_WAIT:g} s: {end_program}",
+        sqlite3.SQLITE_LOCKED: f"another program has locked the ledger: {end_program}",
+        sqlite3.SQLITE_READONLY: "make the ledger and its folder writable and start again",
+        sqlite3.SQLITE_CANTOPEN: "make the ledger's folder writable and start again",
         sqlite3.SQLITE_CORRUPT: damaged,
     }.get(code, damaged if "malformed" in str(error) else "choose another folder")
     return f"{error}; {remedy}"

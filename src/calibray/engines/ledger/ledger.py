@@ -2,7 +2,7 @@
 
 Each answer is committed before the optimizer receives it, so a killed run finds its answers when it is started again.
 Several runs can write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead
-log requires one. Answers that the ledger cannot store are written to a rescue file (see `Ledger.rescue`).
+log requires a local disk. Answers that the ledger cannot store are written to a rescue file (see `Ledger.rescue`).
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Ledger:
                     run("DETACH rescue")
             with suppress(OSError):
                 file.unlink()
-            _LOG.warning("%s: %d answers read from the rescue file %s", self.path, answers, file)
+            _LOG.warning("%s: %s read from the rescue file %s", self.path, counted(answers, "answer"), file)
 
     def close(self) -> None:
         """Close the file."""
@@ -119,7 +119,7 @@ class Ledger:
             database.insert_problem(self._connection, problem, engine, parameters)
 
     def changed_program_files(self, problem: str, files: Mapping[str, str]) -> list[str]:
-        """Names of a program's files that have changed since its calls were stored.
+        """Names of a program's files that have changed since the program's calls were stored.
 
         `files` contains the current files with their digests. If the problem has no stored calls, the current digests
         are stored.
@@ -151,7 +151,9 @@ class Ledger:
             entry = database.read_entry(problem, candidate, row[1:], num_links)
             if isinstance(entry, database.LedgerEntry):
                 return entry
-            _LOG.warning("%s: call %d is damaged (%s); it is deleted and run again", self.path, row[0], entry)
+            _LOG.warning(
+                "%s: call %d is damaged (%s); the call is deleted and run again", self.path, row[0], entry
+            )
             self._connection.execute("DELETE FROM answers WHERE id = ?", (row[0],))
             self._connection.execute(
                 "DELETE FROM rays WHERE problem = ? AND candidate = ?", (problem, candidate)
@@ -170,7 +172,7 @@ class Ledger:
         if self.read_only:
             raise InputError(
                 f"{self.path}: cannot be written, and has no answer for {counted(len(candidates), 'candidate')}; "
-                "make it and its folder writable, or choose another folder"
+                "make the ledger and its folder writable, or choose another folder"
             )
         self._check_identity()
         with self._errors(), database.transaction(self._connection):
@@ -189,7 +191,7 @@ class Ledger:
             database.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: database.LedgerEntry) -> database.LedgerEntry:
-        """Write an entry, unless another run has already written one; return the stored entry.
+        """Write an entry, unless another run has already written an entry; return the stored entry.
 
         Raises:
             EngineError: The ledger cannot store the entry; `rescue` can write it to a file.
@@ -230,7 +232,7 @@ class Ledger:
             EngineError: The ledger cannot be written at present.
         """
         if self.read_only:
-            raise InputError(f"{self.path}: cannot be written; make it and its folder writable")
+            raise InputError(f"{self.path}: cannot be written; make the ledger and its folder writable")
         with self._errors():
             return self._connection.execute(
                 "DELETE FROM answers WHERE failure <> '' AND (?1 IS NULL OR problem = ?1)", (problem,)

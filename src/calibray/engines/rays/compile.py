@@ -1,4 +1,4 @@
-"""Convert a ray table to a path program, with checks and a correction for every path, and back.
+"""Conversion of ray tables to path programs, with checks and a correction for every path, and the reverse conversion.
 
 The correction is the power stated by the engine divided by the power in replay. The correction accounts for properties
 that only the engine models, such as its antennas. At other constants, the replayed power is multiplied by the
@@ -278,7 +278,7 @@ def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
     if (wrong := off > 2 * TOLERANCE * (segment > 0).sum(axis=1) + 1e-4 * length).any():
         worst = int(np.argmax(np.where(wrong, off / length, 0)))
         raise InputError(
-            f"{table.source}: path {table.path[worst]} has the delay {table.delay[worst]:.6g} s, but a length of "
+            f"{table.source}: path {table.path[worst]} has the delay {table.delay[worst]:.6g} s, but its length of "
             f"{length[worst]:.6g} m corresponds to {length[worst] / speed_of_light:.6g} s ({wrong.sum()} of {len(off)} "
             "paths); give the total delay in seconds, not relative to the first path"
         )
@@ -312,15 +312,15 @@ def _assign_links(
     if (lost := off > TOLERANCE).any():
         worst = int(np.argmin(np.where(lost, off, np.inf)))
         fault = (
-            f"{table.source}: {lost.sum()} of {len(lost)} paths do not connect the positions of a link, e.g. "
-            f"path {table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
+            f"{table.source}: path {table.path[worst]} does not connect the positions of a link; the nearest link is "
+            f"{off[worst]:.3g} m away ({lost.sum()} of {len(lost)} paths in all)"
         )
         if lost.all():
             raise InputError(
                 f"{fault}; check the units [m] and the order and signs of x, y and z, or export the rays of the given "
                 "links"
             )
-        _LOG.warning("%s; these paths are omitted", fault)
+        _LOG.warning("%s; such paths are omitted", fault)
     return LinkPositions(ends[:, :3], ends[:, 3:]), np.where(lost, -1, link), chosen.reshape(-1)
 
 
@@ -343,7 +343,7 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
         number = int(np.argmax(repeated))
         raise InputError(
             f"{table.source}: paths {table.path[original[number]]} and {table.path[number]} have the same points and "
-            f"types ({repeated.sum()} of {len(link)} paths are repeats); keep each path once"
+            f"types (repeated paths: {repeated.sum()} of {len(link)}); keep each path once"
         )
 
 

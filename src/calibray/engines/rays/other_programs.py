@@ -25,7 +25,7 @@ from calibray.engines.rays.table import (
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.paths import Paths
-from calibray.support.messages import did_you_mean, first_line, shortened
+from calibray.support.messages import counted, did_you_mean, first_line, shortened
 
 
 class Polyline(NamedTuple):
@@ -65,8 +65,8 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
         if np.isnan(path.power_db):
             ends = " to ".join(np.array2string(path.points[end], precision=3) for end in (0, -1))
             raise InputError(
-                f"{source}: the power of path {number}, from {ends} m, is NaN; check the constants of its materials, "
-                "and compute it again"
+                f"{source}: the power of path {number}, from {ends} m, is NaN; check the constants of the materials "
+                "on the path, and compute the power again"
             )
     count = [len(path.points) for path in paths]
     per_path = {
@@ -151,7 +151,7 @@ def read_insite(files: Sequence[Path], tx_power_dbm: float | None) -> SourceTabl
     """Read the paths in text files `*.paths.*.p2m` of Remcom Wireless InSite, each with one transmitter.
 
     Lines that begin with # are comments. The first line contains the number of receivers. Each receiver has a line with
-    its index and its number of paths; if it has paths, a line of totals follows. Each path has a line of nine numbers
+    its index and its number of paths, and a line of totals if it has any paths. Each path has a line of nine numbers
     (index, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]), or of
     eight numbers without the phase. The line of numbers is followed by a line such as Tx-R-D-Rx and by a line for each
     point.
@@ -249,7 +249,8 @@ def read_aodt(folder: Path) -> SourceTable:
     a row for each path, with its points in units of the scene (centimetres) and its types of interactions. `cirs` has a
     row for each pair of antenna elements, with lists of complex gains and delays [s] in the order of the paths.
 
-    Powers are summed over the antenna elements of the user equipment and averaged over those of the radio unit.
+    Powers are summed over the antenna elements of the user equipment and averaged over the antenna elements of the
+    radio unit.
 
     Raises:
         InputError: A table or column is missing or malformed, or a pair has different numbers of gains and paths.
@@ -269,7 +270,7 @@ def read_aodt(folder: Path) -> SourceTable:
     for pair, rows in frames[0].groupby(AODT_PAIR, sort=False):
         if pair not in responses:
             raise InputError(
-                f"{gains.source}: has no gains for ru_id, ue_id = {pair}, but raypaths has {len(rows)} paths for them"
+                f"{gains.source}: has no gains for ru_id, ue_id = {pair}, but raypaths has {counted(len(rows), 'path')}"
             )
         power, delay = _aodt_response(gains.source, pair, responses[pair], len(rows))
         with np.errstate(divide="ignore"):
@@ -293,8 +294,8 @@ def _aodt_response(
     ]
     if wrong := [len(values) for column in lists for values in column if len(values) != count]:
         raise InputError(
-            f"{source}: {wrong[0]} gains for ru_id, ue_id = {pair}, but raypaths has {count} paths; export both tables "
-            "from the same run"
+            f"{source}: has {counted(wrong[0], 'gain')} for ru_id, ue_id = {pair}, but raypaths has "
+            f"{counted(count, 'path')}; export both tables from the same run"
         )
     real, imaginary, delay = (np.array(column) for column in lists)
     transmitting = len({_aodt_element(item) for item in rows[AODT_ELEMENT]}) if AODT_ELEMENT in rows else 1
@@ -351,7 +352,7 @@ def _aodt_types(table: SourceTable, types: Any) -> list[str]:
 
 DEEPMIMO_TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", "4": "transmission"}
 DEEPMIMO_OLD_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
-"""Names of matrices in earlier versions, by the present names."""
+"""Earlier names of matrices, by their present names."""
 
 
 def is_deepmimo(folder: Path) -> bool:

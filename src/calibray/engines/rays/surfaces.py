@@ -139,7 +139,7 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     # A point displaced by the tolerance changes the directions of both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
     # For each point, faces that satisfy the law of reflection come first, in order of distance.
-    # Among coincident faces, those of the preferred material come first.
+    # Among coincident faces, faces of the preferred material come first.
     preferred = surfaces.material[face] == hits.preferred[index]
     order = np.lexsort((distance - SAME * preferred, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
@@ -167,8 +167,8 @@ def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names:
     surface = "surface of the scene" if stated < 0 else f"surface of {names[stated]!r}"
     return InputError(
         f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface} "
-        f"but must lie within {TOLERANCE} m ({len(lost)} of {len(hits.point)} interactions do not); check the units "
-        "[m], the order and signs of x, y and z, the scene and the material"
+        f"but must lie within {TOLERANCE} m (too far away: {len(lost)} of {len(hits.point)} interactions); check the "
+        "units [m], the order and signs of x, y and z, the scene and the material"
     )
 
 
@@ -210,7 +210,7 @@ class Edge:
 
 
 def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
-    """The edge of a diffraction: of all pairs of faces at the point, the one that satisfies Keller's law best.
+    """The edge of a diffraction: of all pairs of faces at the point, the pair that best satisfies Keller's law.
 
     Raises:
         InputError: No two faces at the point form an edge that diffracts the wave in the direction of the path.
@@ -220,8 +220,8 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
     usable = [edge for edge in edges if edge is not None and edge.error <= 4 * TOLERANCE]
     if not usable:
         raise InputError(
-            f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path there; "
-            "check the vertex, or remove the path"
+            f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path at this "
+            "point; check the vertex, or remove the path"
         )
     # Among pairs with equal errors, the pair is used whose 0-face the wave meets at the angle closest to normal
     # incidence.

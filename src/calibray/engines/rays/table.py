@@ -65,7 +65,7 @@ MOST_POINTS: Final = RANGES["max_depth"][1] + 2
 """Maximum number of points of a path: the maximum number of interactions in a trace, plus both ends."""
 
 NO_POWER: Final = {"power_db": "-inf (-10000 in JSON)", "gain_real": "0", "gain_imag": "0"}
-"""Values in these columns for a path without power."""
+"""Values of the power columns for a path without power."""
 
 POWER_ZERO_DB: Final = -10_000.0
 """Level that replaces -inf [dB]; the corresponding power is 0 in double precision."""
@@ -225,7 +225,7 @@ def _plain(name: str) -> str:
 
 
 def _meant(name: str, absent: set[str]) -> str | None:
-    """The absent column that an unknown name probably refers to, or None."""
+    """The absent column that an unknown name probably refers to; None if there is no such column."""
     words = re.sub(r"[\W_]+", " ", name.casefold())
     for known, pattern in QUANTITIES.items():
         if known in absent and re.search(pattern, words):
@@ -248,7 +248,7 @@ def _kinds(
     if (shared := np.minimum(sources, targets) > 1).any():
         row = int(np.argmax(shared[row_path]))
         raise InputError(
-            f"{table.cell(row, 'path')}: {table.frame['path'].iloc[row]} is the number of more than one path "
+            f"{table.cell(row, 'path')}: several paths have the number {table.frame['path'].iloc[row]} "
             f"({sources[row_path[row]]} transmitters); numbers must be unique in the table, even across links: "
             "renumber all paths, or remove repeated rows"
         )
@@ -348,7 +348,7 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
     if (power > 1).any():
         raise InputError(
             f"{table.source}: gain_real and gain_imag have the magnitude {np.sqrt(power.max()):g}; it must be at most "
-            "1: give the received field divided by the transmitted one, not volts or decibels"
+            "1: give the received field divided by the transmitted field, not volts or decibels"
         )
     return power
 
@@ -418,10 +418,10 @@ def _parsed(content: Path | BytesIO | str | Mapping[Any, Any], source: str) -> S
             frame = pd.DataFrame(json.loads(content) if isinstance(content, str) else content)
     except InputError:
         raise
-    # JSON nested too deeply raises a RecursionError, which is a RuntimeError.
+    # JSON that is nested too deeply raises a RecursionError, which is a RuntimeError.
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         fault = shortened(str(error))
-        raise InputError(f"{source}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
+        raise InputError(f"{source}: is not a ray table ({fault}); see docs/reference/ray-table.md") from None
     return _checked_rows(SourceTable(frame, source=source))
 
 
