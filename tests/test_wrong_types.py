@@ -60,7 +60,9 @@ def test_a_file_or_folder_has_a_name(study: cb.Study, paths: cb.Paths, result: c
         "table": lambda file: cb.read_measurements(file, (0, 0, 0), (1, 1, 1), "loss"),
     }  # fmt: skip
     for role, call in calls.items():
-        refused(f"^{role.strip()}: is a {type(name).__name__}, {NAMES[name]}", lambda call=call: call(name))
+        refused(
+            f"^{role.strip()}: is a {type(name).__name__}; it {NAMES[name]}", lambda call=call: call(name)
+        )
     if name is not None:
         refused("^output folder: is a", lambda: cb.calibrate(study, out=name))
 

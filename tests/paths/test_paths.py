@@ -257,7 +257,7 @@ def test_file_without_a_checksum_is_refused_until_it_is_sealed(paths: Paths, tmp
 
 def test_only_hdf5_files_are_sealed(tmp_path: Path) -> None:
     (tmp_path / "links.csv").write_text("x,y\n1,2\n")
-    with pytest.raises(InputError, match=r"links\.csv: not an HDF5 file"):
+    with pytest.raises(InputError, match=r"links\.csv: is not an HDF5 file"):
         seal(tmp_path / "links.csv")
     with pytest.raises(InputError, match=r"absent\.h5: cannot be sealed"):
         seal(tmp_path / "absent.h5")

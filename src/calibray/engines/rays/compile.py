@@ -371,7 +371,10 @@ def _check_direct(
         what = "with the stated antennas" if known else "between isotropic antennas"
         common = ""
         if np.ptp(off[direct]) < FREE_SPACE_DB and direct.sum() > 1:
-            common = "; all direct paths differ by about this amount, e.g. the transmitted power; subtract this amount"
+            common = (
+                "; all direct paths differ by about this amount, which may be the transmitted power or a cable loss; "
+                "subtract this amount"
+            )
         raise InputError(
             f"{table.source}: path {table.path[worst]}, a direct path, is {abs(off[worst]):.1f} dB {side} free space "
             f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains{common}"
