@@ -189,7 +189,7 @@ def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
     with pytest.raises(InputError, match="two or more links"):
         run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
     held_out = table.assign(spread_ns=table.spread_ns.where(table.rx_x > 15))
-    with pytest.raises(InputError, match="has 0 values at calibration links"):
+    with pytest.raises(InputError, match="values for two or more calibration links, but has 0"):
         run(tmp_path, held_out, observables={"spread": SPREAD}, holdout={"where": "rx_x > 15"})
 
 

@@ -1,4 +1,4 @@
-"""The replay of a study's scene as a cheap model of an engine without derivatives.
+"""A replay of the study's scene, used as a cheap model of an engine without derivatives.
 
 We trace the study's scene once. Evaluating a candidate on the stored paths then takes microseconds. The constants of
 the cheap model are the material constants that the study does not calibrate: thickness, conductivity and permittivity,
@@ -32,7 +32,7 @@ SPREAD: Final = {"thickness": 0.5, "conductivity": 0.7, "relative_permittivity":
 """Standard deviation of the logarithm of a constant around its declared value."""
 
 BOUND: Final = 3.0
-"""Distance of a constant's bounds from its declared value, in standard deviations."""
+"""Distance from a constant's declared value to its bounds, in standard deviations."""
 
 METAL: Final = 1e4
 """Conductivity [S/m] above which a material reflects almost all power, regardless of its other constants."""
@@ -94,7 +94,7 @@ class Rows(Protocol):
 @final
 @dataclass(eq=False)
 class ReplayedModel:
-    """A replay as a cheap model, with the constants that the study does not calibrate.
+    """A replay used as a cheap model; its constants are those that the study does not calibrate.
 
     Attributes:
         engine: The replay; its parameters are those of the study, followed by the constants.
@@ -113,7 +113,7 @@ class ReplayedModel:
 
     def __post_init__(self) -> None:
         start = self.engine.parameters.start
-        # The paths are stored, so a link without a path has none for any other candidate either.
+        # All candidates share the stored paths, so a link without a path here has no path for any candidate.
         self._reached = np.isfinite(self.engine.path_loss(start[None])[0])
 
     @property
@@ -178,7 +178,7 @@ class ReplayedModel:
 
 @dataclass(frozen=True, eq=False)
 class ProblemRows:
-    """The residuals of a problem, including rows of priors.
+    """The residuals of a problem, including the rows for the priors.
 
     Attributes:
         problem: The problem.
@@ -200,7 +200,7 @@ class ProblemRows:
         return self.problem.statistics
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """See `Rows.known`; False for rows of priors, which the model does not predict."""
+        """Mask as in `Rows.known` [m]; False for the rows of the priors, which the model does not predict."""
         weight = self.problem.objective.weight
         priors = int((self.problem.objective.nuisance.prior < np.inf).sum()) + len(self.problem.priors)
         further = [reached[observable.used(weight)] for observable in self.problem.observed]
@@ -225,10 +225,10 @@ class ProblemRows:
 
 @dataclass(frozen=True, eq=False)
 class CheapReplay:
-    """The cheap model of a calibration, if any.
+    """The cheap model of a calibration, or the reason why there is no model.
 
     Attributes:
-        model: The model; None if the study does not request one or if it cannot be made.
+        model: The model; None if the study does not request a model or the model cannot be made.
         remark: The reason why the model cannot be made.
     """
 
@@ -241,7 +241,8 @@ def make_cheap_replay(
 ) -> CheapReplay:
     """Trace a problem's scene for a cheap model if its method uses one; report the reason if this fails.
 
-    If given, `scene` is another study of the same links, which is traced instead. The stage of `progress` is "tracing".
+    If `scene`, another study of the same links, is given, its scene is traced instead. The stage of `progress` is
+    "tracing".
     """
     setup = problem.setup
     section = setup.study.method
@@ -270,9 +271,9 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Add the material constants that are not calibrated to the parameters, on a logarithmic scale.
+    """Extend the parameters by the uncalibrated material constants, on a logarithmic scale.
 
-    If the links have several carriers, constants that depend on frequency stay fixed.
+    If the links have several carrier frequencies, constants that depend on frequency stay fixed.
     """
     calibrated = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
     constants = []

@@ -1,4 +1,4 @@
-"""Elimination of the nuisance: the best coefficients and the projected derivatives of all candidates together.
+"""Elimination of the nuisance: computes the best coefficients and projected derivatives for all candidates at once.
 
 Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
 minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. If each link has an entry in only one
@@ -29,17 +29,17 @@ from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance
 
 DENSE: Final = 2**18
-"""Largest number of entries of a design for which a dense product over all candidates is faster than sparse
+"""Maximum number of entries of a design for which one dense product over all candidates is faster than sparse
 products."""
 
 DEPENDENT: Final = 1e-10
-"""A column counts as linearly dependent if at most this share of its squared norm remains after projection onto the
-preceding columns. Rounding leaves about 1e-16 per column."""
+"""A column counts as linearly dependent if at most this fraction of its squared norm remains after the preceding
+columns are projected out. Rounding leaves about 1e-16 per column."""
 
 PRIOR: Final = 1e-6
-"""Weight of the prior on a linearly dependent column, relative to its squared norm. In three of 600 random problems
-with bounds, the sum of squares is then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose one digit of
-accuracy."""
+"""Weight of the prior on a linearly dependent column, relative to the squared norm of the column. In three of 600
+random problems with bounds, the sum of squares is then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose
+one digit of accuracy."""
 
 ROUNDING: Final = 1e-11
 """Tolerance for bound violations and gradients due to rounding in double precision, relative to the size of the
@@ -49,7 +49,7 @@ PATIENCE: Final = 3
 """Number of full exchanges without progress before single exchanges start."""
 
 MAX_EXCHANGES: Final = 1000
-"""Largest allowed number of exchanges; the tested problems required far fewer."""
+"""Maximum number of exchanges; the tested problems required far fewer."""
 
 Matrix = NDArray[np.float64] | sparse.csr_array
 
@@ -139,7 +139,7 @@ class Elimination:
     def projection(
         self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for those at a bound.
+        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for components at a bound.
 
         They are the negative derivatives of the best coefficients [n, q] with respect to the parameters. `slope`
         contains the derivatives of the modelled path loss at the links with nonzero weight [n, m, d].
@@ -219,7 +219,7 @@ class Arrowhead:
         return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unbounded minima [m, q, k] over the free components for right-hand sides [m, q, k]; the others are zero.
+        """Unconstrained minima [m, q, k] over the free components for right-hand sides [m, q, k]; the rest are zero.
 
         `free` is the mask of the free components [m, q].
         """
@@ -253,13 +253,13 @@ class Arrowhead:
             slack = ROUNDING * (1.0 + np.abs(side[pending]).max(axis=1, initial=0.0))[:, None]
             outside = active & ((trial < lower - slack) | (trial > upper + slack))
             inwards = ((trial <= lower) & (descent > slack)) | ((trial >= upper) & (descent < -slack))
-            # Free components outside their bounds, and fixed ones whose descent direction points inwards.
+            # Free components outside their bounds, and fixed components whose descent direction points inwards.
             infeasible = outside | (~active & inwards)
             value[pending] = np.clip(trial, lower, upper)
             unfinished = infeasible.any(axis=1)
             pending, infeasible = pending[unfinished], infeasible[unfinished]
             if not len(pending):
-                # Values at a bound equal the given bound exactly, without rounding by the scale.
+                # Values at a bound are set to the given bound exactly, to avoid rounding errors from the scaling.
                 inside = np.clip(value / self.scale, given_lower, given_upper)
                 return np.where(value == lower, given_lower, np.where(value == upper, given_upper, inside))
             free[pending] ^= _to_exchange(infeasible, fewest, patience, pending)
@@ -277,7 +277,7 @@ class Arrowhead:
         return self._solve(free, rest[..., None])[..., 0]
 
     def _solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution by block elimination; fixed components have rows of the identity."""
+        """Solve by block elimination; the rows of fixed components are rows of the identity matrix."""
         groups, width, edge = self.border.shape
         split = groups * width
         blocks, border, corner = self._restricted(free)
@@ -293,7 +293,7 @@ class Arrowhead:
     def _restricted(
         self, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Blocks, border and corner with rows and columns of the identity for fixed components."""
+        """Blocks, border and corner, with rows and columns of the identity matrix for fixed components."""
         groups, width, edge = self.border.shape
         inner, outer = free[:, : groups * width].reshape(-1, groups, width), free[:, groups * width :]
         return (
@@ -312,12 +312,12 @@ class Arrowhead:
 
 
 def _dependent(matrix: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Linearly dependent columns [..., b] of Gram matrices of unit columns [..., b, b], by Cholesky elimination."""
+    """Mask of dependent columns [..., b], from Cholesky elimination of Gram matrices of unit columns [..., b, b]."""
     remainder, dependent = matrix.copy(), np.zeros(matrix.shape[:-1], dtype=bool)
     for k in range(matrix.shape[-1]):
         pivot = remainder[..., k, k].copy()
         dependent[..., k] = pivot <= DEPENDENT
-        # A dependent column does not change the later ones.
+        # A dependent column does not change the columns after it.
         root = np.where(dependent[..., k], np.inf, np.sqrt(np.maximum(pivot, DEPENDENT)))
         column = remainder[..., :, k] / root[..., None]
         remainder -= column[..., :, None] * column[..., None, :]
@@ -330,7 +330,7 @@ def _to_exchange(
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Components to exchange [r, q]: all infeasible ones while their number decreases, then the last one of each part.
+    """Mask of components to exchange [r, q]: all infeasible ones while their number decreases, then one of each part.
 
     `infeasible` is the mask of the infeasible components [r, q] of the unsolved problems `pending` [r]. For each
     independent part [m, i], `fewest` (the smallest number so far) and `patience` (the remaining full exchanges without

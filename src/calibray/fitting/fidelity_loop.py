@@ -19,8 +19,9 @@ from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
-"""Traced displacements on each side of a calibrated position, as shares of the largest displacement: 0.5 to 8 m if the
-largest is 8 m. The five inner positions are equidistant, so that the interpolation error can be estimated."""
+"""Traced displacements on each side of a calibrated position, as fractions of the largest displacement. For a largest
+displacement of 8 m, they are 0.5 to 8 m. The five inner positions are equidistant, so that the interpolation error can
+be estimated."""
 
 
 def retrace(
@@ -29,7 +30,7 @@ def retrace(
     """Trace with the calibrated materials, and calibrate again as long as path loss changes by more than the tolerance.
 
     The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
-    them. Path loss at displaced antennas is interpolated. Without refraction, diffuse reflection and displacements, the
+    them. Path loss at displaced antennas is interpolated. Without refraction, diffuse reflection or displacements, the
     paths are not traced again. Only the method `auto` calibrates again; other methods have a fixed budget of RT calls.
     The stage of `progress` is "checking".
 
@@ -75,7 +76,7 @@ def retrace(
         if displaced and paths is not None:
             setup = setup.placed_at(parameters.named(best), AROUND)
             engine, before = replay(setup, paths), best
-            # Start from the stated weights, because interpolation errors around earlier positions no longer apply.
+            # Start from the stated weights, because interpolation errors at earlier positions no longer apply.
             weight, error_db = np.where(objective.weight > 0, stated.weight, 0.0), gap
             for effect in getattr(engine, "effects", ()):
                 if isinstance(effect, DisplacementLoss):
@@ -89,7 +90,7 @@ def retrace(
 def with_interpolation_error(
     objective: Objective, modelled: NDArray[np.float64], error_db: NDArray[np.float64]
 ) -> Objective:
-    """The objective with weights that include the errors of the links' interpolated path loss [L], [dB].
+    """The objective with weights that account for the interpolation errors of the links' path loss [L], [dB].
 
     Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is the
     standard deviation of the interpolation error, in addition to a link's other errors. It is infinite for links that
@@ -102,7 +103,7 @@ def with_interpolation_error(
     variance = np.median(residual**2 * relative) / chdtri(1, 0.5) / relative
     weight = objective.weight.copy()
     weight[counted] *= variance / (variance + error_db[counted] ** 2)
-    # The mean weight has changed, and with it the standard deviation that it represents.
+    # The mean weight has changed, so the standard deviation at the mean weight changes as well.
     noise_db = objective.noise_db * np.sqrt(objective.weight[counted].mean() / weight[counted].mean())
     return replace(objective, weight=weight, noise_db=float(noise_db))
 

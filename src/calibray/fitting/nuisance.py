@@ -1,11 +1,11 @@
-"""Nuisances: columns of a linear design times unknown coefficients, added to the modelled path loss.
+"""Nuisances: linear terms with unknown coefficients, which are added to the modelled path loss.
 
-A term is one column of the links: a constant (an offset), the logarithm of the distance (a slope per decade), or any
-numeric column of the table. It has one coefficient for all links or one per group. Several terms form one design
-[links, q]. The design is sparse: a link has one entry per term, regardless of the number of groups.
+A term has one value per link: a constant (for an offset), the logarithm of the distance (for a slope per decade), or
+any numeric column of the table. A term has one coefficient for all links, or one coefficient per group. Several terms
+form one design [links, q]. The design is sparse: a link has one entry per term, regardless of the number of groups.
 
-The model is linear in the coefficients. For every candidate, the best coefficients follow in closed form (variable
-projection), within their bounds and with Gaussian priors; see `elimination.py`.
+The model is linear in the coefficients. For every candidate, the best coefficients within their bounds and with
+Gaussian priors follow in closed form (variable projection); see `elimination.py`.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
 
 ROUNDING: Final = 1e-9
-"""Largest difference between distances that is attributed to rounding [decades]."""
+"""Maximum difference between distances that is attributed to rounding [decades]."""
 
 UNBOUNDED: Final = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A column of the links with one unknown coefficient, or one coefficient per group of links.
+    """A column of values, one per link, with one unknown coefficient for all links or one per group of links.
 
     Attributes:
         name: Name of the term.
         by: The column: "constant", "log_distance", or a column of the links' table.
         value: The values of the column [L]: 1 for a constant; decades of distance relative to `centre` for
             "log_distance"; otherwise in the unit of the table.
-        group: Index of each link's group in `labels` [L]; -1 for a link in none of these groups.
+        group: Index of each link's group in `labels` [L]; -1 for a link that belongs to none of these groups.
         labels: Labels of the groups; one empty label if all links share one coefficient.
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
         prior: Standard deviation of the coefficients' Gaussian prior around zero, in the unit of the bounds; +inf if
             flat.
         centre: Value subtracted from the column: for "log_distance", the mean of log10(distance / 1 m) over the links
             for which the term was made; otherwise 0.
-        around: For the deviations of a random effect, the name of the term with their mean; otherwise "".
+        around: For the deviations of a random effect, the name of the term that holds their mean; otherwise "".
     """
 
     name: str
@@ -74,7 +74,7 @@ class Term:
         return tuple(f"{self.name}[{label}]" if label else self.name for label in self.labels)
 
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
-        """The term with the same columns at other links, for prediction.
+        """The same term evaluated at other links, for prediction.
 
         A link whose group label [n] is unknown belongs to no group. Pass no labels for a term without groups.
 
@@ -149,20 +149,20 @@ def make_term(
 def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) -> tuple[Term, Term]:
     """The two terms of a random effect: a shared coefficient, and the deviation of each group from it.
 
-    `by` is as in `make_term`, and `labels` are the labels of the links' groups [L]. `estimate_noise` replaces the prior
-    of the deviations with the estimated spread.
+    `by` is as in `make_term`, and `labels` are the labels of the links' groups [L]. `estimate_noise` sets the prior
+    standard deviation of the deviations to the estimated spread.
     """
     deviations = make_term(links, deviations_of(name), by, labels=labels, prior=START_SPREAD)
     return make_term(links, name, by), replace(deviations, around=name)
 
 
 def deviations_of(name: str) -> str:
-    """Name of the term with the deviations of a random effect's groups from their mean."""
+    """Name of the term that holds the deviations of a random effect's groups from their mean."""
     return f"{name}, deviation"
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:
-    """Label each link's transmitter by its position, rounded to the centimetre [L]."""
+    """Label each link with the position of its transmitter, rounded to the centimetre [L]."""
     return np.array([",".join(f"{value:z.2f}" for value in tx) for tx in links.tx], dtype=np.str_)
 
 
@@ -233,10 +233,10 @@ class Nuisance:
 
     @cached_property
     def design(self) -> sparse.csr_array:
-        """The design [L, q]: a link's row has one entry for each term with a group that contains the link."""
+        """The design [L, q]: the row of a link has one entry for each term that has a group containing the link."""
         parts = [sparse.csr_array((self.num_links, 0))]
         for term in self.terms:
-            # A link in none of the groups has no entry.
+            # A link that belongs to none of the groups has no entry.
             row = np.flatnonzero(term.group >= 0)
             entries = (term.value[row], (row, term.group[row]))
             parts.append(sparse.csr_array(entries, shape=(self.num_links, len(term.labels))))
@@ -258,7 +258,7 @@ class Nuisance:
             by_grouping.setdefault(term.group.tobytes(), []).append(index)
         finest = max(by_grouping.values(), key=lambda terms: (len(self.terms[terms[0]].labels), len(terms)))
         groups = len(self.terms[finest[0]].labels)
-        # Group by group, the columns of all terms with these groups.
+        # Group by group, list the columns of all terms that have these groups.
         inner = (first[finest][None] + np.arange(groups)[:, None]).ravel()
         order = np.concatenate([inner, np.setdiff1d(np.arange(first[-1]), inner)])
         return order.astype(np.int64), groups, len(finest)
@@ -283,13 +283,13 @@ class Nuisance:
         return filled
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Standard deviation of each link's random effects that no other block determines [L], [dB].
+        """Standard deviation, for each link, of the random effects that no other block determines [L], [dB].
 
         `block` is the index of each link's block, or -1 for a link that is not used [L].
         """
         variance = np.zeros(self.num_links)
         for term in self.terms:
-            # If a group is in one block only, no link of another block determines its coefficient.
+            # If all links of a group are in one block, no other block determines the coefficient of this group.
             pairs = np.unique(np.stack([term.group, block])[:, block >= 0], axis=1)
             alone = np.bincount(pairs[0], minlength=len(term.labels)) == 1
             variance += (
@@ -300,12 +300,12 @@ class Nuisance:
     def by_term(
         self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> dict[str, dict[str, float]]:
-        """Determined coefficients [q] by term and group; those of a random effect are the mean plus the deviation."""
+        """Determined coefficients [q] by term and group; a random effect's values are the mean plus the deviation."""
         coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:
             last = first + len(term.labels)
-            # The mean of a random effect is the term before its deviations.
+            # The term with the mean of a random effect precedes the term with its deviations.
             shared = coefficient.get(term.around, {}).get("", 0.0)
             values = zip(term.labels, coefficients[first:last].tolist(), determined[first:last], strict=True)
             coefficient[term.around or term.name] = {

@@ -1,21 +1,22 @@
 """The objective that a calibration minimises.
 
 The objective is the paper's weighted RMSE (eq. 1) over the links with nonzero weight. Nuisances (an offset or other
-columns of a linear design) enter the model as path loss + design x coefficients. For every candidate, the best
+columns of a linear design) are added to the model: path loss + design x coefficients. For every candidate, the best
 coefficients follow in closed form (variable projection), so optimizers search only the parameters.
 
 A Gaussian prior on a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
 of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows; `rmse` is
 the paper's RMSE over the links only. Without priors, the two are equal.
 
-The objective of many links is summed over chunks. For gaps g (measured minus modelled path loss), derivatives J,
-weights w and a nuisance's design Z, a chunk returns [J g]' w [J g] and Z' w [J g]. Their sums over all chunks give the
-normal equations with the nuisance eliminated. With A = [J g] and the best coefficients X of every column,
+For many links, the objective is summed over chunks of links. For gaps g (measured minus modelled path loss),
+derivatives J, weights w and a nuisance's design Z, a chunk returns [J g]' w [J g] and Z' w [J g]. The sums of these
+products over all chunks give the normal equations with the nuisance eliminated. With A = [J g] and the best
+coefficients X of every column,
 
     (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
 
-From these products we build a few rows with the same squares and products as the residuals of all links. Methods that
-use only squares and products work with these rows.
+From these products we build a few rows whose squares and products equal those of the residuals of all links. Methods
+that use only squares and products of the residuals work with these rows.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Sums:
     """Sums over links for n candidates and k columns: the derivatives, if requested, then the gap.
 
     Attributes:
-        square: Products A'wA of the columns [n, k, k]; the square of the gap is infinite if a link has no path.
+        square: Products A'wA of the columns [n, k, k]; the square of the gap is infinite if any link has no path.
         side: Products with the design Z'wA [n, q, k].
     """
 
@@ -51,7 +52,7 @@ class Sums:
 @final
 @dataclass(frozen=True, eq=False)
 class Share:
-    """The objective's data for one chunk of links; a call with the chunk's path loss returns the chunk's sums.
+    """The objective's data for one chunk of links; calling it with the path loss of these links returns their sums.
 
     Attributes:
         links: Indices within the chunk of its m links with nonzero weight [m].
@@ -78,7 +79,7 @@ class Share:
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
         gap = self.measured - (loss if self.ceiling_db is None else np.minimum(loss, self.ceiling_db))
         lost = np.asarray(~np.isfinite(gap).all(axis=1))
-        # Candidates for which a link has no path are marked below; their sums must stay finite here.
+        # Candidates that leave a link without a path are marked below; their sums must stay finite here.
         columns = np.where(lost[:, None], 0.0, gap)[..., None]
         if derivative is not None:
             slope = np.where((at_ceiling | lost[:, None])[..., None], 0.0, derivative[:, self.links])
@@ -98,7 +99,7 @@ class Objective:
     Attributes:
         measured: Measured path loss [L], [dB].
         weight: Weights of the links [L]; a link with weight 0 is left out.
-        nuisance: The nuisance; may have no terms.
+        nuisance: The nuisance; it may have no terms.
         ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error at the mean weight, which scales the priors [dB].
     """
@@ -119,7 +120,7 @@ class Objective:
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The best coefficients of the nuisance [n, q], [dB] per unit of their columns, for path loss [n, L], [dB].
 
-        Links without a path for a candidate are left out of its fit. A coefficient that is not `determined` has the
+        Links without a path for a candidate are left out of its fit. A coefficient that is not `determined` takes the
         value nearest to 0 within its bounds.
 
         Raises:
@@ -128,10 +129,10 @@ class Objective:
         return self._fitted(self.measured - self.capped(path_loss))
 
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The `coefficients` for predicting other links [n, q], from path loss [n, L], [dB].
+        """The `coefficients` that are used to predict other links [n, q], from path loss [n, L], [dB].
 
-        A coefficient that is not `determined` is the mean of the determined ones of its term. The determined
-        coefficients are then fitted again.
+        A coefficient that is not `determined` is set to the mean of the determined coefficients of its term. The
+        determined coefficients are then fitted again.
         """
         gap = self.measured - self.capped(path_loss)
         coefficients = self._fitted(gap)
@@ -149,7 +150,7 @@ class Objective:
         reached = np.isfinite(gap)
         if reached.all():
             return self._elimination.coefficients(gap)
-        # Candidates with paths at the same links share one elimination.
+        # Candidates with paths for the same set of links share one elimination.
         coefficients = np.empty((len(gap), len(self.nuisance.columns)))
         patterns, pattern_of = np.unique(reached, axis=0, return_inverse=True)
         for number, pattern in enumerate(patterns):
@@ -169,7 +170,7 @@ class Objective:
         return -self._elimination.projection(slope, self.coefficients(path_loss))
 
     def coefficient_root(self) -> NDArray[np.float64]:
-        """Root R of the covariance R R' of the coefficients at given path loss [q, q]; large if not `determined`."""
+        """Root R of the covariance R R' of the coefficients for given path loss [q, q]; large if not `determined`."""
         wide_prior = np.where(self.determined, np.inf, UNKNOWN_DB)
         gram = self._elimination.data.toarray() + np.diag(self._ridge**2 + (self.noise_db / wide_prior) ** 2)
         return self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
@@ -189,7 +190,7 @@ class Objective:
     def fitted(self) -> float:
         """Number of coefficients that the links determine, each weighted by the links' share of its precision.
 
-        Coefficients that their priors hold at zero explain no residuals, regardless of the number of groups.
+        Coefficients whose priors keep them at zero explain no residuals, regardless of the number of groups.
         """
         if not self.nuisance.terms:
             return 0.0
@@ -230,7 +231,7 @@ class Objective:
             self._elimination.remove(slope, projection)
             has_prior = self._ridge > 0
             if has_prior.any():
-                # The best coefficients change by minus the projection.
+                # The derivatives of the best coefficients are minus the projection.
                 prior_rows = -(projection * self._ridge[:, None])[:, has_prior]
         slope *= self._scale[:, None]
         return slope if prior_rows is None else np.concatenate([slope, prior_rows], axis=1)
@@ -248,7 +249,7 @@ class Objective:
         return np.sqrt(np.mean(links**2, axis=1))
 
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """The objective's shares for the chunks of links, which can be summed separately."""
+        """The objective's share for each chunk of links; each share can be summed separately."""
         weight, shares = np.zeros(len(self.weight)), []
         weight[self._counted] = self._scale**2
         for chunk in chunks:
@@ -268,7 +269,7 @@ class Objective:
         return shares
 
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Squares and products of residuals and their derivatives, from sums over all links.
+        """Squares and products of the residuals and of their derivatives, from sums over all links.
 
         The results are the products of the k columns [derivatives, -residuals], including rows of priors [n, k, k], and
         the sum of squares over the links only [n], [dB^2].
@@ -291,7 +292,7 @@ class Objective:
 
     @property
     def num_rows(self) -> int:
-        """Number of residuals: links with nonzero weight, and coefficients with a prior."""
+        """Number of residuals: the links with nonzero weight plus the coefficients with a prior."""
         return self.num_counted + int(np.count_nonzero(self._ridge > 0))
 
     @property
@@ -304,7 +305,10 @@ class Objective:
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [L], [dB], plus the nuisance fitted to links with nonzero weight; other groups get the mean."""
+        """Path loss [L], [dB], plus the nuisance fitted to links with nonzero weight.
+
+        Coefficients that these links do not determine are set to the mean of their term.
+        """
         return self.capped(path_loss) + self.nuisance.contribution(self.completed(path_loss[None]))[0]
 
     def _model(
@@ -322,7 +326,7 @@ class Objective:
 
     @cached_property
     def _counted(self) -> NDArray[np.int64] | slice:
-        """The links with nonzero weight; a slice if these are all links, which avoids copies."""
+        """Indices of the links with nonzero weight; a slice if all links have nonzero weight, which avoids copies."""
         counted = self.weight > 0
         return slice(None) if counted.all() else np.flatnonzero(counted)
 
@@ -359,7 +363,7 @@ def make_objective(
         links: All links.
         reached: Mask of the links with a path [L].
         calibrated: Mask of the calibration links [L].
-        nuisance: The nuisance over all links; if None, there is none.
+        nuisance: The nuisance over all links; None if the model has no nuisance.
         ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.
         noise_db: Standard deviation of a link's error [dB]; required if a coefficient has a prior.
 
@@ -389,7 +393,7 @@ def make_objective(
 
 
 def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
-    """Add the sums of all chunks, in the order of their shares, for `columns` columns of the nuisance."""
+    """Add the sums of all chunks, in the order of `shares`, for a nuisance with `columns` columns."""
     square = np.zeros_like(parts[0].square)
     side = np.zeros((len(square), columns, square.shape[2]))
     for part, share in zip(parts, shares, strict=True):
@@ -408,7 +412,7 @@ def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     size = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
-    # Scale to a unit diagonal first: otherwise rounding errors of large columns exceed the small columns.
+    # Scale to a unit diagonal first; otherwise the rounding errors of large columns exceed the small columns.
     values, vectors = np.linalg.eigh(products / (size[:, :, None] * size[:, None, :]))
     root = np.sqrt(np.maximum(values, 0.0))
     return root[:, :, None] * vectors.transpose(0, 2, 1) * size[:, None, :]

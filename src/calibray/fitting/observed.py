@@ -1,8 +1,8 @@
-"""Further observables in the objective; the rows of their residuals follow those of path loss.
+"""Further observables in the objective; their residuals follow the residuals of path loss.
 
-Like the rows of priors, these rows are weighted by the ratio of the standard deviations of the errors. Up to constants,
-the sum of squares is therefore minus twice the log likelihood, in units of the noise variance of path loss. An unknown
-bias is eliminated: it is the mean residual of its group.
+Like the rows of the priors, these residuals are weighted by the ratio of the standard deviations of the errors. Up to
+constants, the sum of squares is therefore minus twice the log likelihood, in units of the noise variance of path loss.
+An unknown bias is eliminated: its estimate is the mean residual of its group.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from calibray.study import Setup
 from calibray.study.observables import FILTERED
 
 LEAST: Final = 1e-6
-"""Smallest standard deviation of an observable's errors, relative to that of its values."""
+"""Minimum standard deviation of an observable's errors, relative to the standard deviation of its values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +69,13 @@ class Observed:
     def residuals(
         self, modelled: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Modelled minus measured values [n, m] in the study's unit, without the bias, and the biases [n, groups].
+        """Modelled minus measured values [n, m] in the study's unit, with the bias removed, and the biases [n, groups].
 
         Modelled values [n, L] are in SI units; the links have weights [L].
         """
         used = self.used(weight)
         gap = modelled[:, used] / self.scale - self.measured[used]
-        # A link without a path for a candidate has no statistic: its residual is 0, and the biases ignore it.
+        # If a link has no path for a candidate, its residual is 0, and the biases are estimated without this link.
         found = np.isfinite(gap)
         gap = np.where(found, gap, 0.0)
         if not self.labels:
@@ -145,11 +145,11 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
         count = int(np.isfinite(measured[~setup.held_out]).sum())
         if count < 2:
             raise InputError(
-                f"{links.source}: {place} of [observables.{name}] has {count} values at calibration links; values at "
-                "two or more links are required: add measurements, or change [holdout]"
+                f"{links.source}: {place} of [observables.{name}] must have values for two or more calibration "
+                f"links, but has {count}; add measurements, or change [holdout]"
             )
         group, labels = _groups(links, section.bias)
-        # Equal values have no deviation; 1 is used until the error is estimated from the residuals.
+        # If all values are equal, their standard deviation is 0; use 1 until the error is estimated from the residuals.
         std = float(np.nanstd(measured)) or 1.0 if section.std is None else section.std
         every.append(
             Observed(
@@ -184,7 +184,7 @@ def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], t
 def with_errors(
     every: tuple[Observed, ...], modelled: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[Observed, ...]:
-    """The observables, with errors estimated from the residuals where the study states none.
+    """The observables; errors that the study does not state are estimated from the residuals.
 
     Modelled values [K, L] are in SI units; the links have weights [L].
     """

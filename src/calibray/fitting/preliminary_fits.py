@@ -1,18 +1,19 @@
-"""Fits before the calibration: they leave out links near the noise floor, and estimate the noise and spreads.
+"""Fits before the calibration; they exclude links near the noise floor, and estimate the noise and the spreads.
 
-Near the noise floor, a link is received only if its error is favourable. A selection by measured values keeps these
-links and biases the fit. A selection by predicted values does not, because the prediction is independent of the link's
-error (selection on the explanatory variables: J. M. Wooldridge, Econometric Analysis of Cross Section and Panel Data,
-2nd ed., MIT Press 2010, chapter 19). We first fit the model to all links above the floor. We then refit it to the links
-that are predicted well above the floor, until the selection is stable.
+Near the noise floor, a link is received only if its error is favourable. Selecting links by their measured values keeps
+these links and biases the fit. Selecting links by their predicted values causes no bias, because the prediction is
+independent of the link's error (selection on the explanatory variables: J. M. Wooldridge, Econometric Analysis of Cross
+Section and Panel Data, 2nd ed., MIT Press 2010, chapter 19). We first fit the model to all links above the floor. We
+then refit it to the links whose predicted power is well above the floor, until the selection is stable.
 
 Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X contains the columns
 of all other fitted terms. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for
-the scatter that the fit of b removes; maximum likelihood does not and therefore underestimates the spread.
+the scatter that the fit of b removes; maximum likelihood does not account for this scatter and therefore underestimates
+the spread.
 
 Spreads of transmitters are estimated by expectation maximization with a Gaussian approximation at the optimum (D. Bates
-and S. DebRoy, J. Multivariate Analysis 91, 2004, section 5): the squared spread is the mean over the transmitters of
-the squared value plus its variance.
+and S. DebRoy, J. Multivariate Analysis 91, 2004, section 5): the squared spread is the mean, over the transmitters, of
+the squared value plus the variance of the value.
 """
 
 from __future__ import annotations
@@ -40,28 +41,28 @@ from calibray.tracing.antennas import NEW, POSE
 _LOG: Final = logging.getLogger(__name__)
 
 MARGIN: Final = 8.0
-"""Required distance of a predicted path loss from the noise floor, in standard deviations of the links' errors.
+"""Required margin between the predicted path loss and the noise floor, in standard deviations of the links' errors.
 Position errors make paths appear and vanish, which gives the errors heavy tails; a margin of four leaves some bias."""
 
 SMALL_MARGIN: Final = 4.0
 """Margin used if `MARGIN` leaves fewer than `LINKS_PER_UNKNOWN` links per unknown, or no links that determine an
-offset. With errors of 5.5 dB over a range of 35 dB, a slope is 12 % too low if all links are kept, and 2 % too high
-(standard error 2 %) with this margin."""
+offset. For errors of 5.5 dB and path loss over a range of 35 dB, the fitted slope is 12 % too low if all links are
+kept, and 2 % too high (standard error 2 %) with this margin."""
 
 SELECTIONS: Final = 4
-"""Largest number of selections."""
+"""Maximum number of selections."""
 
 NOISE_ESTIMATES: Final = 5
-"""Largest number of noise estimates; each uses priors weighted by the previous estimate."""
+"""Maximum number of noise estimates; each estimate weights the priors by the previous one."""
 
 TOLERANCE: Final = 0.02
 """Relative change of the estimates at which the iteration ends."""
 
 LEAST_NOISE_DB: Final = 1e-3
-"""Lower limit of the noise estimate [dB], so that priors keep a nonzero weight for data without noise."""
+"""Lower limit of the noise estimate [dB]; it keeps the weight of the priors above zero for data without noise."""
 
 LEAST_SPREAD_DB: Final = 0.05
-"""Lower limit of the spread between groups [dB per unit of the column], so that the prior's weight stays finite."""
+"""Lower limit of the spread between groups [dB per unit of the column]; it keeps the weight of the prior finite."""
 
 SEARCHES: Final = 32
 """Number of local searches of the first fit; later fits continue from its minima."""
@@ -87,7 +88,7 @@ def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> 
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
         starts = fit.minima[:SEARCHES]
         rmse_db = float(problem.squares(fit.best.x[None]).rmse_db[0])
-        # Each unknown removes a degree of freedom, so the RMSE underestimates the error of a link.
+        # Each unknown removes a degree of freedom, so the RMSE underestimates the standard deviation of a link's error.
         error_db = rmse_db * np.sqrt(objective.num_counted / max(problem.freedom, 1))
         predicted = objective.model(problem.modelled(fit.best.x[None]))[0]
         before, selected = faint, _far_from(limit - margin * error_db, predicted, objective, all_weights)
@@ -128,7 +129,7 @@ def _determines_as_much(problem: Problem, selected: Objective) -> bool:
 
 
 def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_]) -> None:
-    """Warn about the bias if links near the noise floor are kept because the others determine fewer unknowns."""
+    """Warn of a bias if links near the noise floor are kept because the other links determine fewer unknowns."""
     determined = selected.determined if (selected.weight > 0).any() else np.zeros(1, dtype=bool)
     lost = np.flatnonzero(problem.objective.determined & ~determined)
     names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
@@ -199,11 +200,11 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 
 
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
-    """Estimate the spreads of a problem's random effects at a point of the search space [d].
+    """Estimate the spreads of a problem's random effects, at a point of the search space [d].
 
     The first result is the problem with these spreads. The second result is the standard deviation of a link's error
-    within the groups of the last effect [dB]. On an engine without derivatives, both are estimated at the initial
-    values, for which path loss is known.
+    within the groups of the last effect [dB]. On an engine without derivatives, both results are estimated at the
+    initial values, for which path loss is known.
     """
     objective = problem.objective
     counted = np.flatnonzero(objective.weight > 0)
@@ -212,7 +213,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
     for index, term in enumerate(terms):
         if not term.around:
             continue
-        # Without the deviations in the model, the residuals contain their scatter.
+        # With the deviations left out of the model, their scatter remains in the residuals.
         others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
         without = replace(problem, objective=replace(objective, nuisance=others))
         jacobian = None
@@ -221,8 +222,8 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
             residuals, jacobian = evaluation.residuals[0], evaluation.slopes[0]
         else:
             residuals = without.objective.residuals(problem.before[None])[0]
-        # Rows of priors follow those of the links, so that the other effects are random, not fixed: as fixed effects,
-        # places would explain the differences between the streets that contain them.
+        # The rows of the priors follow the rows of the links, so that the other effects are random. As fixed effects,
+        # places would explain the differences between the streets that contain these places.
         ridge = objective.noise_db / others.prior
         priors = np.diag(ridge)[ridge > 0]
         columns = [np.vstack([others.design[counted].toarray() * scale[:, None], priors])]
@@ -240,7 +241,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
-    """The problem with the errors of its further observables estimated at a point of the search space [d]."""
+    """The problem with errors of the further observables that are estimated at a point of the search space [d]."""
     if not problem.observed:
         return problem
     candidate = problem.parameters.from_search(point[None])
@@ -253,10 +254,10 @@ def _with_noise(problem: Problem, noise_db: float) -> Problem:
 
 
 RATIOS: Final = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 121)])
-"""Ratios lambda of the variance between groups to that within groups at which the likelihood is evaluated."""
+"""Ratios lambda of the variance between groups to the variance within groups, at which the likelihood is evaluated."""
 
 SINGULAR: Final = 1e-10
-"""Share of the largest singular value of the design below which its columns are treated as linearly dependent."""
+"""Fraction of the design's largest singular value below which columns are treated as linearly dependent."""
 
 
 class GroupSpread(NamedTuple):
@@ -323,10 +324,10 @@ def group_spread(
 
 
 ROUNDS: Final = 20
-"""Largest number of estimates; three suffice if the links determine the values of most transmitters well."""
+"""Maximum number of estimates; three suffice if the links determine the values of most transmitters well."""
 
 LEAST: Final = 1e-3
-"""Lower limit of a spread, as a share of the width of the bounds, so that the weights of the priors stay finite."""
+"""Lower limit of a spread, as a fraction of the width of the bounds; it keeps the weights of the priors finite."""
 
 
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
@@ -359,7 +360,8 @@ def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Prob
         spreads = {}
         for field, numbers in members.items():
             width = parameters.upper[numbers[0]] - parameters.lower[numbers[0]]
-            # The prior shrinks fitted values towards 0; adding their variances corrects for this.
+            # The prior shrinks fitted values towards 0; adding the variances of these values corrects for the
+            # shrinkage.
             square = np.mean(fit.best.x[numbers] ** 2 + variance[numbers])
             spreads[field] = float(max(np.sqrt(square), LEAST * width))
         stated = problem.setup.study

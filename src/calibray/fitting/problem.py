@@ -35,9 +35,9 @@ class Evaluation(NamedTuple):
 
     Attributes:
         value: The objective, including priors [n].
-        residuals: Weighted residuals, then one row per prior [n, m].
-        jacobian: Their derivatives with respect to the search coordinates [n, m, d]; None if not requested.
-        modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
+        residuals: Weighted residuals, followed by one row per prior [n, m].
+        jacobian: Derivatives of the residuals with respect to the search coordinates [n, m, d]; None if not requested.
+        modelled: The engine's values [n, L]; [n, 0] if the engine returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
         represents: Number of full residuals that the m compressed residuals represent; both have the same mean squares
             and products. None if the residuals are not compressed.
@@ -59,7 +59,7 @@ class Evaluation(NamedTuple):
 
     @property
     def curvature(self) -> NDArray[np.float64]:
-        """Products of the derivatives J'J, summed over all full residuals [n, d, d]."""
+        """Products J'J of the derivatives, summed over all full residuals [n, d, d]."""
         slopes = self.slopes
         return np.einsum("nmi,nmj->nij", slopes, slopes) * (self.num_rows / slopes.shape[1])
 
@@ -88,7 +88,7 @@ class Problem:
         priors: Priors of the parameters.
         faint: Mask of the links that are left out because they are censored or predicted near the noise floor [L]; None
             if no link is left out.
-        observed: Further observables of the links, whose residuals follow those of path loss.
+        observed: Further observables of the links; their residuals follow the residuals of path loss.
     """
 
     setup: Setup
@@ -112,7 +112,7 @@ class Problem:
         study, links, held_out = setup.study, setup.links, setup.held_out
         further = observed(setup, engine) if observable is PATH_LOSS else ()
         if further and isinstance(engine, Observing):
-            # A call can be expensive, so a single one returns path loss and all observables.
+            # A call can be expensive, so a single call returns path loss and all observables.
             statistics = tuple(observable.statistic for observable in further)
             before = engine.respond(engine.parameters.start[None], statistics).path_loss[0]
         else:
@@ -183,7 +183,7 @@ class Problem:
         answer = self.respond(candidates, with_slopes)
         evaluation = self.judge(candidates, answer)
         if with_slopes and answer.loss_slope is not None:
-            # Chain rule: from physical units to the search coordinates.
+            # By the chain rule, convert derivatives from physical units to the search coordinates.
             unit = self.parameters.search_slope(candidates)
             further = (
                 None if answer.observed_slope is None else answer.observed_slope * unit[:, None, None, :]
@@ -193,7 +193,7 @@ class Problem:
         return evaluation
 
     def judge(self, candidates: NDArray[np.float64], answer: Responses) -> Evaluation:
-        """The evaluation, without derivatives, of candidates in physical units [n, d] from the engine's response."""
+        """Evaluate candidates in physical units [n, d] from the engine's response, without derivatives."""
         residuals = self.residuals(candidates, answer.path_loss, answer.observed)
         rmse_db = np.sqrt(np.mean(residuals[:, : self.objective.num_counted] ** 2, axis=1))
         value = np.sqrt(np.mean(residuals**2, axis=1))
@@ -217,7 +217,7 @@ class Problem:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
 
         If the engine divides the links into chunks, each chunk returns sums, and d + 1 compressed residuals represent
-        those of all links. Otherwise the residuals are not compressed.
+        those of all links. With any other engine, the residuals are not compressed.
         """
         if self._chunks is None:
             return self.evaluate(points, derivatives)
@@ -232,7 +232,7 @@ class Problem:
             unit[:, :-1] = parameters.search_slope(candidates)
         products = products * unit[:, :, None] * unit[:, None, :]
         if len(self.priors):
-            # Columns as in the sums: derivatives, then the gap, which is minus the residual.
+            # The columns are in the order of the sums: derivatives, then the gap, which is minus the residual.
             prior_rows = -objective.noise_db * self.priors.residuals(candidates)[..., None]
             if derivatives:
                 slopes = objective.noise_db * self.priors.jacobian(candidates) * unit[:, None, :-1]
@@ -269,7 +269,7 @@ class Problem:
 
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
-        """The engine reduced to sums over its chunks, and the objective's shares for them; None without chunks."""
+        """The engine that returns sums over its chunks, and the objective's share of each; None without chunks."""
         if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)
@@ -281,7 +281,7 @@ class Problem:
         modelled: NDArray[np.float64],
         observed: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Weighted residuals [n, m]: of modelled values [n, L], of priors of parameters, then of further observables.
+        """Weighted residuals [n, m] of modelled values [n, L], followed by those of priors and further observables.
 
         Candidates [n, d] are in physical units, and further observables [n, K, L] in SI units.
         """
@@ -301,7 +301,7 @@ class Problem:
     ) -> NDArray[np.float64]:
         """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any others.
 
-        They follow from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
+        They are computed from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """
         parts = [self.objective.jacobian(modelled, slope)]
         if len(self.priors):
@@ -314,7 +314,7 @@ class Problem:
         return np.concatenate(parts, axis=1)
 
     def _further(self, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Residuals of each further observable [n, m], scaled to the error of path loss."""
+        """Residuals of each further observable [n, m], scaled to the standard deviation of path loss errors."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
             noise_db / observable.std * observable.residuals(observed[:, index], weight)[0]
@@ -322,7 +322,7 @@ class Problem:
         ]
 
     def _further_slopes(self, slope: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Derivatives of `_further` [n, m, k], from those of the observables [n, K, L, k]."""
+        """Derivatives of the residuals in `_further` [n, m, k], from derivatives of the observables [n, K, L, k]."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
             noise_db / observable.std * observable.slopes(slope[:, index], weight)

@@ -1,11 +1,11 @@
-"""Find an engine's assumptions from ratios of its rays' powers: a global search over constants and polarizations.
+"""Find an engine's assumptions from ratios of ray powers, by a global search over constants and polarizations.
 
-Materials are added one at a time. Each material is scanned (`ray_scan.py`) on paths without materials that are added
-later. Least squares with exact derivatives on all these paths then refines the best points, for several polarizations,
-jointly with the values already found. The best few explanations are kept. A further starting point combines the study's
-constants with the polarizations that fit them best. If a misfit remains, linear polarizations are searched with the
-materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
-Doye, 1997): it moves one or two materials to other resonances and refines the result.
+Materials are added one at a time. Each material is scanned (`ray_scan.py`) on the paths that meet none of the materials
+added later. A least-squares fit to all these paths, with exact derivatives and several polarizations, then refines the
+best points jointly with the values already found. The best few explanations are kept. A further starting point combines
+the study's constants with the polarizations that fit best. If a misfit remains, linear polarizations are searched with
+the materials fixed, and then each material is scanned again on all its paths. The last step is basin hopping (Wales and
+Doye, 1997): each trial moves one or two materials to other resonances and refines the result.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ KEPT: Final = 3
 """Number of explanations that are kept from one material to the next."""
 
 EXACT_DB: Final = 0.005
-"""Misfit at which a search ends [dB]; smaller differences do not tell explanations apart."""
+"""Misfit at which a search ends [dB]; smaller misfits do not distinguish between explanations."""
 
 KNOWN_DB: Final = 0.02
-"""Misfit below which the explanation of earlier calls is kept for the next call [dB]; wrong minima had misfits of at
+"""Misfit below which the explanation of earlier calls is kept for the next call [dB]; misfits at wrong minima were at
 least 0.1 dB."""
 
 EVALUATIONS: Final = (6, 12, 30)
-"""Largest number of evaluations with each loss function: in a trial, between scans, and in the last refinement."""
+"""Maximum number of evaluations for each loss function: in a trial, between scans, and in the last refinement."""
 
 TRIALS: Final = 300
-"""Largest number of trials of basin hopping. Stopping after 150 trials without improvement gave about the same
+"""Maximum number of basin-hopping trials. Stopping after 150 trials without improvement gave about the same
 misfits."""
 
 TRIED_PATHS: Final = 500_000
-"""Largest product of the number of trials and the number of paths, which limits the time of basin hopping."""
+"""Maximum product of the number of trials and the number of paths; it limits the time spent on basin hopping."""
 
 PROMISING: Final = 3.0
 """A trial is refined further if its misfit is less than this multiple of the largest misfit among the explanations that
 are kept."""
 
 MOST_HOPS: Final = 30
-"""Largest change of a thickness in a trial [half wavelengths in the slab]."""
+"""Maximum change of a thickness in a trial [half wavelengths in the slab]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,22 +72,22 @@ class Understanding:
     misfit_db: float
 
     def replay(self, parameters: Parameters, last: Call) -> Replay:
-        """The replay of a call's paths, corrected so that it agrees with the call."""
+        """The replay of a call's paths, corrected to agree with the powers of the call."""
         paths = self.model.replay_paths(last.candidate, self.values, self.linear)
-        # Power of every path in the engine, relative to its power in the replay.
+        # Power of every path according to the engine, relative to the power in the replay.
         correction = 10 ** (last.export.level_db / 10) / np.maximum(powers(paths), 1e-300)
         return Replay(replace(paths, correction=correction), parameters)
 
 
 class Ratio(NamedTuple):
-    """Power ratios of the n paths that the last call has in common with an earlier one.
+    """Power ratios of the n paths that the last call has in common with an earlier call.
 
     Attributes:
         call: The earlier call.
         here: Indices of the paths in the last call, ascending [n].
         weight: Weights of the paths [n]; the sum over all ratios is 1.
         level_db: Power in the last call [n], [dB].
-        observed: Power in the last call relative to that in the earlier one [n], [dB].
+        observed: Power in the last call relative to the power in the earlier call [n], [dB].
     """
 
     call: Call
@@ -107,8 +107,8 @@ def understand(
 ) -> Understanding:
     """Find the assumptions that explain the ratios of all calls.
 
-    If `before`, the assumptions for the earlier calls, is given, the search starts from it. The paths of the last call
-    are modelled. `known` states whether the program's antennas are those of the engine.
+    If `before`, the assumptions found from the earlier calls, is given, the search starts from these assumptions. The
+    model contains the paths of the last call. `known` states whether the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -127,7 +127,7 @@ def understand(
 
 
 def half_spaces(fit: Understanding, calls: list[Call]) -> tuple[str, ...]:
-    """Materials whose assumed thickness the ratios of the calls do not determine, as with half-spaces.
+    """Materials whose assumed thickness is not determined by the ratios of the calls, as for a half-space.
 
     If a half-space replaces the slab of such a material, the misfit increases by at most `EXACT_DB`.
     """
@@ -195,7 +195,7 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
 
     A thickness changes by a whole number of half wavelengths in the slab, which leads to another resonance. The
     conductivity stays the same, preserves the attenuation through the slab, or changes at random. One trial in three
-    also changes the tilts of unknown antennas.
+    also changes the tilts of the antennas if they are unknown.
     """
     model, values = fit.model, fit.values.copy()
     materials = model.materials(last.candidate, fit.values)
@@ -218,7 +218,7 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
 
 
 def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with the same constants and the best polarizations of upright antennas; none if antennas are known.
+    """Explanations with the same constants and the best polarizations of upright antennas; empty for known antennas.
 
     Many engines differ from the study only in their antennas.
     """
@@ -236,7 +236,10 @@ def _best(fits: list[Understanding]) -> list[Understanding]:
 
 
 def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
-    """Mask of the materials on each path [P, M], and the materials with a parameter, alone on the most paths first."""
+    """Mask of the materials on each path [P, M], and the calibrated materials in the order in which they are scanned.
+
+    Materials that are the only material on many paths come first.
+    """
     paths, names = model.paths, list(model.paths.materials)
     meets = np.zeros((paths.num_paths, len(names)), dtype=bool)
     meets[np.repeat(np.arange(paths.num_paths), np.diff(paths.first)), paths.material] = True
@@ -250,8 +253,8 @@ def _scanned(
 ) -> list[Understanding]:
     """Explanations with different constants of one material, from scans on the paths in the mask `wanted` [P].
 
-    A scan with upright antennas of all polarizations starts from the first explanation. Other scans use the antennas of
-    each explanation and so account for tilts.
+    One scan starts from the first explanation and uses upright antennas with all polarizations. Other scans use the
+    antennas of each explanation and so account for tilts.
     """
     model, first = fits[0].model, np.isinf(fits[0].misfit_db)
     name = list(model.paths.materials)[material]
@@ -294,7 +297,7 @@ def _scanned(
 
 
 def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with different antenna angles and the same materials."""
+    """Explanations with the same materials and different antenna angles."""
     model, count = fit.model, len(fit.model.assumed)
     gains = model.gains(last.candidate, fit.values)
     parts = [
@@ -309,14 +312,14 @@ def _turned(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Underst
 
 
 def _polarized(fit: Understanding, slants: tuple[float | None, float | None]) -> Understanding:
-    """The explanation with upright antennas of given slants."""
+    """The same explanation with upright antennas at the given slants."""
     angles = [part for slant in slants for part in (slant or 0.0, 0.0, 0.0)]
     values = np.concatenate([fit.values[: len(fit.model.assumed)], angles])
     return replace(fit, values=values, linear=(slants[0] is not None, slants[1] is not None))
 
 
 def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: int) -> Understanding:
-    """Least squares on all ratios, starting from an explanation; values that change no ratio stay fixed."""
+    """Least-squares fit to all ratios, starting from an explanation; values that change no ratio stay fixed."""
     lower, upper = fit.model.bounds
     start, tables = np.clip(fit.values, lower, upper), _tables(fit.model, ratios, last)
     size = np.linalg.norm(_errors(replace(fit, values=start), ratios, tables)[1], axis=0)
@@ -352,7 +355,7 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
 
 
 def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.float64]:
-    """Constants at the last call and at the earlier calls, all for the paths of the last call."""
+    """Constants at the last call and at the earlier calls, evaluated for the paths of the last call."""
     return model.tables([last.candidate, *(ratio.call.candidate for ratio in ratios)])
 
 
@@ -361,8 +364,8 @@ def _errors(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted errors of the ratios [m], [dB], and their derivatives with respect to the values [m, k].
 
-    If a path has power in the engine but none in the model, no correction can restore it. Its error is `LEAST_DB` minus
-    the power in the engine.
+    If a path has power in the engine but not in the model, no correction can restore this power. The error of such a
+    path is `LEAST_DB` minus the power in the engine.
 
     `tables` contains the constants of the last call and of each ratio's call; see `_tables`.
     """
@@ -378,7 +381,7 @@ def _errors(
 
 
 def ratios_of(calls: list[Call]) -> list[Ratio]:
-    """The ratios of the last call to every earlier call that shares a path with it."""
+    """The ratios of path powers between the last call and every earlier call with at least one common path."""
     last = calls[-1].export
     pairs = [(call, *common(last.paths, call.export.paths)) for call in calls[:-1]]
     total = sum(last.weight[here].sum() for _, here, _ in pairs)
@@ -406,7 +409,7 @@ def common(one: Paths, other: Paths) -> tuple[NDArray[np.int64], NDArray[np.int6
             if (gap := float(np.abs(points - others).max(initial=0))) <= TOLERANCE
         ]
         taken = set()
-        # The nearest pairs come first: both edges of a thin wall are within the tolerance of one another.
+        # The nearest pairs come first, because both edges of a thin wall are within the tolerance of each other.
         for _, index, k in sorted(near):
             if index not in partner and k not in taken:
                 partner[index] = k

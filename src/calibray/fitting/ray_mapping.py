@@ -1,14 +1,14 @@
 """Ray mapping identifies the assumptions of an expensive engine from its rays, and replaces the engine with a replay.
 
-A few calls are enough. Each call returns the power of each path. The ratio of a path's powers for two sets of constants
-does not depend on antenna gains or units. The ratios therefore reveal the engine's assumptions: thickness,
-conductivity, slabs or half-spaces, and the polarization of its antennas. We fit these assumptions to all ratios of the
-calls so far (`ray_fit.py`). The power of every path is then corrected to match the last call. The next call is at the
-minimum of the replay of this corrected program, and tests this replay.
+A few calls are enough. Each call returns the power of each path. The ratio of a path's powers between two calls does
+not depend on antenna gains or units. The ratios therefore reveal the engine's assumptions: thickness, conductivity,
+slabs or half-spaces, and the polarization of its antennas. We fit these assumptions to all ratios of the calls so far
+(`ray_fit.py`). The power of every path is then corrected to match the last call. The next call, at the minimum of this
+corrected replay, tests the replay.
 
 The first call is at the initial values. The second call is at the point where the ratios are most informative about the
-assumed constants. Among `PROBES` random points, this point has the largest mean log determinant of the information
-matrix.
+assumed constants. This point has the largest mean log determinant of the information matrix among `PROBES` random
+points.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ Ask = Callable[[NDArray[np.float64]], Export]
 """Calls the engine for a candidate [d]; returns its rays."""
 
 PROBES: Final = 32
-"""Number of points of the search space from which the second call is chosen."""
+"""Number of random points of the search space from which the second call is chosen."""
 
 DRAWS: Final = 3
 """Number of sets of assumed constants over which the information is averaged."""
 
 DRAWN: Final = 3.0
-"""Largest factor between an assumed constant in one of these `DRAWS` sets and the study's value."""
+"""Maximum factor between an assumed constant in one of the `DRAWS` sets and the study's value."""
 
 SIGMA_DB: Final = 0.1
-"""Standard deviation of a ratio's error assumed in the information matrix [dB]."""
+"""Standard deviation of the error of a ratio that the information matrix assumes [dB]."""
 
 LEFT_DB: Final = 0.05
 """An optimum counts as reached only if the best call and the minimum of the replay differ by at most this much, in the
@@ -56,27 +56,27 @@ objective and in RMS path loss [dB]."""
 
 GAP_DB: Final = 0.2
 """An optimum counts as reached only if the gap at the last call is at most this large [dB]. After six calls, the excess
-RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above
-0.36 dB."""
+RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB. It was 0.020 to 0.15 dB in eight runs with gaps
+above 0.36 dB."""
 
 MISFIT_DB: Final = 0.2
-"""An engine counts as understood only if the misfit of its ratios is at most this large [dB]. At 0.07 to 0.19 dB, the
-optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
+"""An engine counts as understood only if the misfit of its ratios is at most this large [dB]. With misfits of 0.07 to
+0.19 dB, the optimum was reached within 0.006 dB (docs/measurements/expensive-engines.md)."""
 
 CHANGED_DB: Final = 0.5
-"""An engine counts as understood only if paths that another call lacks change no link's path loss by more than this
-[dB]. Paths that appear between calls may be missing at the minimum of the replay."""
+"""An engine counts as understood only if leaving out the paths that are not common to all calls changes no link's path
+loss by more than this [dB]. Paths that appear between calls may be missing at the minimum of the replay."""
 
 SEARCHES: Final = 4
-"""Number of local searches relative to a calibration by replay; a call costs more than many searches. In a district
-with 557 interactions, 512 and 1,024 searches with two of five seeds missed a minimum that is 0.076 dB lower; 2,048
-searches found it with all five."""
+"""Number of local searches, as a multiple of the number in a calibration by replay; one call costs more than many
+searches. In a district with 557 interactions, 512 and 1,024 searches with two of five seeds missed a minimum that is
+0.076 dB lower; 2,048 searches found it with all five."""
 
 LEAST_CALLS: Final = 3
-"""Smallest number of calls of ray mapping: two to identify the assumptions, and one at the minimum."""
+"""Minimum number of calls in ray mapping: two to identify the assumptions, and one at the minimum."""
 
 MOST_CALLS: Final = 10
-"""Largest number of calls of ray mapping."""
+"""Maximum number of calls in ray mapping."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +88,17 @@ class RayMap:
         calls: The calls; from the third on, each is at the minimum of the replay that was fitted to the earlier calls.
         best: The call with the lowest objective.
         understanding: The assumptions that explain the engine.
-        gap_db: RMS over the links of the difference between the engine's and the predicted path loss at the last call
-            [dB].
+        gap_db: RMS difference, over the links, between the engine's path loss and the predicted path loss at the last
+            call [dB].
         changed: Largest number of paths that occur in the best call but not in another call, or vice versa.
-        changed_db: Largest change of a link's path loss if these paths are left out, over links that keep a path [dB].
+        changed_db: Largest change in the path loss of a link if these paths are left out, among the links that keep a
+            path [dB].
         lost: Number of links that lose all their paths, or that have no path in the replay at the best call.
         half_spaces: Materials whose thickness the calls do not determine.
         minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
-        remaining_db: Objective on this replay at the best call minus that at the lowest of these minima [dB].
-        moved_db: RMS over the links of the replay's path loss at that minimum minus that at the best call [dB].
+        remaining_db: Objective of this replay at the best call minus the objective at the lowest of these minima [dB].
+        moved_db: RMS difference, over the links, between the replay's path loss at the lowest minimum and at the best
+            call [dB].
     """
 
     engine: Replay
@@ -155,7 +157,7 @@ def _most_calls(setup: Setup) -> int:
 def search_rays(
     problem: Problem, engine: Exporting, progress: Progress | None = None
 ) -> tuple[Problem, Trail, Remark]:
-    """Search by ray mapping, on an engine that returns its rays.
+    """Search by ray mapping on an engine that returns its rays.
 
     Returns the problem on the replay that replaces the engine, the search, and a remark on how well the engine's
     assumptions are identified. The stage of `progress` is "calibrating".
@@ -188,12 +190,12 @@ def search_rays(
 def map_rays(
     problem: Problem, ask: Ask, *, tolerance_db: float = 0.01, most_calls: int = MOST_CALLS, seed: int = 0
 ) -> RayMap:
-    """Call an engine until path loss at the minimum is predicted within the tolerance or `most_calls` calls are made.
+    """Call an engine until path loss at the minimum is predicted within the tolerance, with at most `most_calls` calls.
 
-    The result contains the replay that replaces the engine, and its accuracy. Calls also continue if the minimum of the
-    replay is not at the best call, because an accurate prediction of a short step does not show that the model is
-    accurate elsewhere. They end if links have lost all paths in two successive calls at minima. The engine is called
-    through `ask`; the engine of `problem` is not called.
+    The result contains the replay that replaces the engine, and the accuracy of this replay. Calls also continue if the
+    minimum of the replay is not at the best call: an accurate prediction over a short step does not show that the model
+    is accurate elsewhere. Calls end if links have lost all their paths in two successive calls at minima. The engine is
+    called through `ask`; the engine of `problem` is not called.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -227,7 +229,7 @@ def map_rays(
         )
         if mapped.moved_db <= LEFT_DB or repeated or len(calls) >= most_calls:
             return mapped
-        # The rays of the last call in this order are modelled.
+        # The model contains the rays of the last call in this order.
         ordered, understanding = _best_last(problem, calls), mapped.understanding
         further = mapped.minima[:1]
 
@@ -244,7 +246,7 @@ def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64]
 def _finish(
     problem: Problem, calls: list[Call], known: bool, understanding: Understanding, gap: float
 ) -> RayMap:
-    """The replay that agrees with the engine at the best call, its minima, and its accuracy."""
+    """The ray mapping with the replay that agrees with the engine at the best call."""
     parameters, ordered = problem.parameters, _best_last(problem, calls)
     final, best = understand(parameters, ordered, known, understanding), ordered[-1]
     replay = final.replay(parameters, best)
@@ -268,7 +270,7 @@ def _best_last(problem: Problem, calls: list[Call]) -> list[Call]:
 
 
 def with_engine(problem: Problem, replay: Replay) -> Problem:
-    """The problem on a replay; links without a path in it are left out unless the objective has a ceiling."""
+    """The problem with a replay as its engine; without a ceiling, links without a path in the replay are left out."""
     objective = problem.objective
     if objective.ceiling_db is None:
         reached = np.isfinite(replay.path_loss(problem.parameters.start[None])[0])
@@ -282,12 +284,12 @@ def _objective(problem: Problem, call: Call) -> float:
 
 
 def _gap(replay: Replay, call: Call) -> float:
-    """RMS over the links of the difference between the engine's and the predicted path loss [dB]."""
+    """RMS difference, over the links, between the engine's path loss and the predicted path loss [dB]."""
     return _distance(call.export.path_loss_db, replay.path_loss(call.candidate[None])[0])
 
 
 def _distance(path_loss: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Root mean square of the difference over the links that have a path in both [dB]; +inf if there are none."""
+    """RMS difference over the links that have a path in both [dB]; +inf if there are no such links."""
     both = np.isfinite(path_loss) & np.isfinite(other)
     return float(np.sqrt(np.mean((path_loss[both] - other[both]) ** 2))) if both.any() else np.inf
 
@@ -312,10 +314,10 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
 
 
 def _changes(calls: list[Call]) -> tuple[int, float, int]:
-    """Largest number of paths that occur in the last call but not in another one, or vice versa, and their effect.
+    """Largest number of paths that occur in the last call but not in another call, or vice versa, and their effect.
 
-    The second result is the largest change of path loss if these paths are left out [dB]. The third is the largest
-    number of links that lose all paths.
+    The second result is the largest change in path loss if these paths are left out [dB]. The third result is the
+    largest number of links that lose all their paths.
     """
     last, changed, change_db, lost = calls[-1].export, 0, 0.0, 0
     for call in calls[:-1]:
@@ -346,7 +348,7 @@ def _remark(mapped: RayMap, problem: Problem) -> Remark:
     return Remark(
         RemarkKind.RAY_MAPPING,
         {
-            # A value is infinite if calls have no path, or no link, in common.
+            # A value is infinite if the calls have no path or no link in common.
             **{name: value for name, value in levels.items() if np.isfinite(value)},
             "understood": mapped.understood,
             "reached": mapped.reached,

@@ -1,9 +1,9 @@
 """The powers of an engine's rays as a function of the parameters and of the engine's assumptions.
 
-An engine makes assumptions about antennas and about material constants (thickness, conductivity and permittivity) that
-are not calibrated. The gain of an antenna cancels in ratios of powers, but its polarization does not. An unpolarized
-antenna receives both components of a wave. Any other antenna is linearly polarized at a slant angle in the frame of its
-axis (3GPP TR 38.901, eq. 7.3-4/5); the axis may be tilted.
+An engine makes assumptions about antennas and about uncalibrated material constants (thickness, conductivity and
+permittivity). The gain of an antenna cancels in ratios of powers, but its polarization does not. An unpolarized antenna
+receives both components of a wave. Any other antenna is linearly polarized at a slant angle in the frame of its axis
+(3GPP TR 38.901, eq. 7.3-4/5); the axis may be tilted.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in physical units."""
 
 PERMITTIVITY_FACTOR: Final = 2.0
-"""Largest factor between the study's value and the engine's value of a permittivity that is not calibrated."""
+"""Maximum factor between the study's value and the engine's value of a permittivity that is not calibrated."""
 
 TILT: Final = 0.3
-"""Largest tangent of the tilt of an antenna's axis along x or y. It corresponds to 17 degrees, which exceeds the tilt
+"""Maximum tangent of the tilt of an antenna's axis along x or y. It corresponds to 17 degrees, which exceeds the tilt
 of base stations."""
 
 ANGLES: Final = 3
-"""Number of angles of the antenna at one end: the slant and two tilts."""
+"""Number of angles of the antenna at each end: the slant and two tilts."""
 
 BATCH: Final = 8
 """Number of candidates that are evaluated together; the program is compiled for this number."""
@@ -65,7 +65,7 @@ LEAST_DB: Final = -300.0
 _COLUMNS: Final = tuple(FIELD_COLUMN[field] for field in (*RANGES, "relative_permittivity"))
 
 Ends = tuple[bool, bool]
-"""Whether the antennas are linearly polarized, at the transmitter and at the receiver."""
+"""Whether the antennas are linearly polarized: first at the transmitter, then at the receiver."""
 
 
 class Call(NamedTuple):
@@ -85,7 +85,7 @@ class RayModel:
     Attributes:
         paths: The program, without correction.
         parameters: The study's parameters.
-        known: Whether the program's antennas are those of the engine; otherwise they have the ports V and H.
+        known: Whether the program's antennas are those of the engine; otherwise the antennas have the ports V and H.
     """
 
     paths: Paths
@@ -99,7 +99,7 @@ class RayModel:
 
     @cached_property
     def assumed(self) -> tuple[tuple[str, str], ...]:
-        """Material and field of every assumed constant: uncalibrated, nonzero, of a nonmetal on at least one path."""
+        """Material and field of every assumed constant: nonzero, uncalibrated constants of nonmetals on any path."""
         calibrated = {(item.material, item.constant) for item in self.parameters}
         met = set(np.unique(self.paths.material).tolist())
         return tuple(
@@ -112,7 +112,7 @@ class RayModel:
 
     @cached_property
     def meets_calibrated(self) -> bool:
-        """Whether any path interacts with a material with a parameter; otherwise no ratio of powers differs from 1."""
+        """Whether any path meets a calibrated material; otherwise all ratios of powers are 1."""
         met = {list(self.paths.materials)[index] for index in np.unique(self.paths.material)}
         return any(item.material in met for item in self.parameters)
 
@@ -143,7 +143,7 @@ class RayModel:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Power of every path [n, P], [dB], and its derivatives with respect to the values [n, P, k].
 
-        The n candidates are given by their constants [n, M, 8]. The assumed values [k] are the same for all of them.
+        The n candidates are given by their constants [n, M, 8]. The assumed values [k] are the same for all candidates.
         """
         (program, polarized), names, count = self._by_path, list(self.paths.materials), len(self.assumed)
         rows = [names.index(name) for name, _ in self.assumed]
@@ -195,14 +195,14 @@ class RayModel:
         fields = [self.paths.tx_field, self.paths.rx_field]
         angles = values[len(self.assumed) :].reshape(-1, ANGLES)
         for end in np.flatnonzero(linear).tolist() if not self.known else []:
-            # The antenna receives along its polarization only; the second row is orthogonal to it.
+            # The antenna receives only along its polarization; the second row is the orthogonal polarization.
             weights = ports(self.bases[end], angles[end])[:, 0]
             fields[end] = np.einsum("pt,ptc->pc", weights, fields[end])[:, None]
         materials = self.materials(candidate, values)
         return replace(self.paths, materials=materials, tx_field=fields[0], rx_field=fields[1])
 
     def described(self, values: NDArray[np.float64], half_spaces: Sequence[str]) -> dict[str, float]:
-        """Names and values [k] of the assumed constants; the materials `half_spaces` have no thickness."""
+        """Names and values [k] of the assumed constants, without the thickness of the materials in `half_spaces`."""
         return {
             f"{name}.{field}": value
             for (name, field), value in zip(self.assumed, np.exp(values).tolist(), strict=False)
@@ -230,7 +230,7 @@ class RayModel:
     def _by_path(self) -> tuple[GroupedProgram, Polarized]:
         """The program with one link per path, and the polarization of its antennas."""
         count = self.paths.num_paths
-        # Path loss of such a link is minus the power of its path in dB, whatever the phase.
+        # The path loss of such a link is minus the power of its path in dB, regardless of the phase.
         nowhere = np.zeros((count, 3))
         plan = layout(
             replace(self.paths, link=np.arange(count), tx_position=nowhere, rx_position=nowhere), phases=False
@@ -246,7 +246,8 @@ class Polarized:
     Attributes:
         tx: Unit vectors theta and phi of the fields at the transmitter [P, 2, 3].
         rx: The same at the receiver.
-        linear: Whether the antenna at each end is linearly polarized [2]; otherwise it receives both components.
+        linear: Whether the antenna at each end is linearly polarized [2]; otherwise the antenna receives both
+            components.
     """
 
     tx: NDArray[np.float64]
@@ -279,9 +280,9 @@ class Polarized:
 
 
 def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
-    """Unit vector theta of antennas with axes [..., 3], as components [..., P, 2] along those of the fields [P, 2, 3].
+    """Unit vector theta of antennas with axes [..., 3], as components [..., P, 2] along the field vectors [P, 2, 3].
 
-    It points away from the pole: it is the normalised component of -axis orthogonal to the direction.
+    It points away from the pole: it is the component of -axis orthogonal to the direction, scaled to unit length.
     """
     theta = -xp.einsum("pac,...c->...pa", basis, axis)
     return theta / xp.sqrt(xp.maximum(xp.sum(theta**2, axis=-1, keepdims=True), 1e-12))

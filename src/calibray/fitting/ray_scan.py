@@ -1,14 +1,14 @@
-"""Scans of one material's constants, and of antennas, for starting points of a fit to ratios of path powers.
+"""Scans of a material's constants and of antenna angles; they give starting points for a fit to ratios of path powers.
 
 A slab resonates: the power of a ray varies periodically with the thickness, and the period is half a wavelength. A
 local search can therefore end in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the
-wave has decayed, for several conductivities, with several polarizations at both ends. It uses only paths that consist
-of reflections and transmissions.
+wave has decayed. It does so for several conductivities and several polarizations at both ends. A scan uses only paths
+that consist of reflections and transmissions.
 
 An antenna receives almost no power from a direction in which the wave is orthogonal to its polarization. Every path
 near such a null adds a minimum of the misfit. These minima are about 0.02 rad apart, so a local search from upright
 antennas ends in a wrong minimum. With the materials fixed, the gain of a path is bilinear in the polarizations of both
-ends. A scan therefore evaluates a grid of slants and tilts of one end, with the other end first as fitted and then
+ends. A scan therefore evaluates a grid of slants and tilts at one end; the other antenna is first as fitted and then
 upright. Local searches over all angles start from the best points of this grid.
 """
 
@@ -33,13 +33,13 @@ from calibray.materials import Material
 from calibray.paths import Kind, Paths
 
 CONDUCTIVITIES: Final = 10.0 ** np.arange(-3.5, 1.1, 0.5)
-"""Conductivities of a scan [S/m]; a local search covers the half decade between them."""
+"""Conductivities of a scan [S/m]; a local search covers the half decade between neighboring values."""
 
 THINNEST: Final = 1e-3
-"""Smallest thickness of a scan [m]."""
+"""Minimum thickness in a scan [m]."""
 
 THICKEST: Final = 0.6
-"""Largest thickness of a scan [m], or twice the study's thickness if that is larger."""
+"""Maximum thickness in a scan [m], unless twice the study's thickness is larger."""
 
 RESOLUTION: Final = 20.0
 """Number of scanned thicknesses per wavelength in the slab; a slab has two resonances per wavelength of thickness."""
@@ -49,7 +49,7 @@ ROBUST_DB: Final = 1.5
 of a scan changes the ratio by tens of dB."""
 
 SCANNED: Final = 48
-"""Largest number of paths evaluated in a scan."""
+"""Maximum number of paths evaluated in a scan."""
 
 KEPT: Final = 3
 """Number of local minima that are kept from each scan of a material, and from a search over antennas."""
@@ -63,16 +63,16 @@ SLANTS: Final = (0.0, np.pi / 2, np.pi / 4, -np.pi / 4)
 """Slants of a linear polarization [rad]: vertical, horizontal, and both diagonals."""
 
 POLARIZATIONS: Final = [(tx, rx) for tx in (None, *SLANTS) for rx in (None, *SLANTS)]
-"""Slants at both ends; None for an unpolarized antenna."""
+"""Pairs of slants at the transmitter and the receiver; None for an unpolarized antenna."""
 
 STARTS: Final = 6
 """Number of points of each scan from which local searches start; four of the six best starts found the true angles."""
 
 TILTS: Final = np.linspace(-TILT, TILT, 15)
-"""Tilts of a scan along x and along y: 0.04 rad apart, twice the distance between minima."""
+"""Tilts in a scan, along x and along y: the step of 0.04 rad is twice the distance between minima."""
 
 FINE_SLANTS: Final = np.pi * (np.arange(80) / 80 - 0.5)
-"""Slants of a scan [rad]; a linear polarization has the period pi."""
+"""Slants in a scan of antenna angles [rad]; a linear polarization has a period of pi in the slant."""
 
 
 def robust(square: Any) -> Any:
@@ -81,10 +81,10 @@ def robust(square: Any) -> Any:
 
 
 class Observed(NamedTuple):
-    """Power ratios of n paths between the last call and an earlier one.
+    """Power ratios of n paths between the last call and an earlier call.
 
     Attributes:
-        materials: The materials of the earlier call; the scanned constants are replaced.
+        materials: The materials of the earlier call; the scan replaces the scanned constants.
         weight: Weights of the paths [n].
         change_db: Power at the last call relative to that at the earlier one [n], [dB].
     """
@@ -100,7 +100,7 @@ class Scan:
 
     Attributes:
         values: Logarithms of the scanned constants [H, K, c].
-        misfit: Mean loss of the ratios [H, K]; inf where a pair has fewer than K minima.
+        misfit: Mean loss of the ratios [H, K]; infinite if a pair of polarizations has fewer than K minima.
     """
 
     values: NDArray[np.float64]
@@ -117,13 +117,13 @@ def scan(
     """Scan the constants of one material.
 
     Args:
-        paths: Paths with only reflections and transmissions; their antennas have the ports V and H unless they are
-            known.
+        paths: Paths with only reflections and transmissions; their antennas have the ports V and H unless the antennas
+            are known.
         name: The material.
         fields: The scanned constants: thickness, conductivity, or both.
         last: The materials of the last call.
         calls: The ratios to earlier calls.
-        known: Whether the antennas are known; there is then only one pair of polarizations.
+        known: Whether the antennas are known; if so, there is only one pair of polarizations.
     """
     everything = [materials[name] for materials in (last, *(call.materials for call in calls))]
     grid = _grid(fields, everything, paths.materials[name].thickness, paths.frequency)
@@ -139,7 +139,7 @@ def scan(
 
 
 def chosen(paths: Paths, subset: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The paths that a scan evaluates: the simplest and shortest with only reflections and transmissions."""
+    """The paths that a scan evaluates: the simplest and shortest paths with only reflections and transmissions."""
     other = ~np.isin(paths.kind, (Kind.SPECULAR, Kind.REFRACTION))
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     subset = np.setdiff1d(subset, path[other])
@@ -181,7 +181,7 @@ def _minima(
         # The best conductivity of every thickness.
         first = order[np.flatnonzero(np.diff(group[order], prepend=-1))]
         lowest = square[first, pair]
-        # Both ends of the range can be minima.
+        # Either end of the range can be a minimum.
         around = np.minimum(np.append(np.inf, lowest[:-1]), np.append(lowest[1:], np.inf))
         found = first[lowest <= around]
         found = found[np.argsort(square[found, pair], kind="stable")[:KEPT]]
@@ -190,9 +190,9 @@ def _minima(
 
 
 class _Scanned(NamedTuple):
-    """The P paths of a scan with at most D interactions, at the last call and at C earlier calls.
+    """The P paths of a scan, each with at most D interactions, at the last call and at C earlier calls.
 
-    P is always `SCANNED`, so few functions have to be compiled. Missing paths have weight 0.
+    P is always `SCANNED`, so that few functions have to be compiled. Missing paths have weight 0.
 
     Attributes:
         exists: Whether a path has an interaction with this index [D, P].
@@ -323,7 +323,7 @@ class Gains(NamedTuple):
 
 
 def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The best angles [6] of two linear polarizations, lowest misfit first, from a search around given angles [6]."""
+    """The best angles [6] of two linearly polarized antennas, lowest misfit first, from a search near `angles` [6]."""
     upright = angles.copy().reshape(2, ANGLES)
     upright[:, 0] = np.pi / 4 * np.round(upright[:, 0] / (np.pi / 4))
     upright[:, 1:] = 0.0
@@ -337,7 +337,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
     bound = np.tile([3 * np.pi, TILT, TILT], 2)
     found = []
     for start in starts:
-        # The soft loss reduces the weight of paths near a null, as in the search for all values.
+        # As in the search for all values, the soft loss reduces the weight of paths near a null.
         fit = least_squares(
             lambda angles: errors(parts, angles), np.clip(start, 1e-9 - bound, bound - 1e-9), bounds=(-bound, bound),
             loss="soft_l1", f_scale=ROBUST_DB, x_scale=0.05, max_nfev=30,
@@ -347,7 +347,7 @@ def antennas(parts: list[Gains], angles: NDArray[np.float64]) -> list[NDArray[np
     _, distinct = np.unique(np.round([cost for cost, _ in found], 6), return_index=True)
     lowest = [found[index][1] for index in distinct[:KEPT]]
     for each in lowest:
-        # A linear polarization has the period pi.
+        # A linear polarization has a period of pi in the slant.
         each[[0, ANGLES]] = np.remainder(each[[0, ANGLES]] + np.pi / 2, np.pi) - np.pi / 2
     return lowest
 
@@ -367,7 +367,7 @@ def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _scan_angles(parts: list[Gains], end: int, other: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Sets of angles [3] of one end with the smallest losses, for given angles of the other end."""
+    """Sets of angles [3] at one end with the smallest losses, for given angles at the other end."""
     x, y = (each.ravel() for each in np.meshgrid(TILTS, TILTS))
     axis, loss = np.stack([x, y, np.ones_like(x)], axis=1), 0.0
     cos, sin = np.cos(FINE_SLANTS)[:, None], np.sin(FINE_SLANTS)[:, None]

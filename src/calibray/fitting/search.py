@@ -29,7 +29,7 @@ from calibray.support.progress import Progress
 AUTO: Final = "auto"
 
 STARTS: Final = (16, 512)
-"""Smallest and largest number of local searches of a multi-start method."""
+"""Minimum and maximum number of local searches in a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
 """Target for the number of local searches times the number of interactions of the path program. It keeps the time of a
@@ -102,7 +102,7 @@ def _make(
 
 
 def local_searches(interactions: int) -> int:
-    """Number of starting points of a multi-start method: fewer on larger path programs."""
+    """Number of starting points of a multi-start method, which decreases with the size of the path program."""
     return int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))
 
 
@@ -110,13 +110,13 @@ Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Evaluates points of the search space [n, d]; the flag requests derivatives."""
 
 SEARCHES: Final = 64
-"""Number of local searches for further minima if the method kept only its best one."""
+"""Number of local searches for further minima if the method kept only its best minimum."""
 
 BASINS: Final = 24
-"""Largest number of known minima that are used as starting points for a changed problem."""
+"""Maximum number of known minima that are used as starting points for a changed problem."""
 
 RELEVANT: Final = 20.0
-"""Largest excess of the sum of squares at a relevant minimum over that at the lowest one, in noise variances. It
+"""Maximum excess of the sum of squares at a relevant minimum over the sum at the lowest minimum, in noise variances. It
 corresponds to a likelihood ratio of e^-10."""
 
 
@@ -127,7 +127,7 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
         The candidates of every round, as points of the search space [n, d], and their evaluation.
     """
     derivatives = optimizer.needs_derivatives()
-    # The matrices of surrogates are small, so BLAS threads would cost more time than they save.
+    # Surrogates use small matrices, so BLAS threads would cost more time than they save.
     with single_blas_thread():
         while not optimizer.done:
             points = optimizer.ask()
@@ -148,7 +148,7 @@ def least_squares(problem: Problem, starts: int, x0: NDArray[np.float64], **sett
 
 @dataclass
 class Trail:
-    """The record of a search: every RT call in order, the best candidate, and the cost.
+    """The record of a search: every RT call in order, the best candidate, and the cost of the search.
 
     Attributes:
         candidates: The candidates in physical units, each [d].
@@ -161,7 +161,8 @@ class Trail:
         best_rmse_db: RMSE of the best candidate [dB].
         best_value: Objective of the best candidate, including priors [dB].
         minima: Minima of the optimizer's searches, best first, as points of the search space [k, d].
-        rt_calls: RT calls of the search, including calls of an earlier run that are answered from the ledger.
+        rt_calls: Number of RT calls of the search, including calls from an earlier run that are answered from the
+            ledger.
         ledger_hits: Number of calls that are answered from the ledger.
         modelled: The engine's values for each candidate [L], only for an engine without derivatives.
         observed: Further observables for each candidate [K, L], only for an engine without derivatives.
@@ -195,7 +196,7 @@ class Trail:
             self.best_db.append(self.best_rmse_db)
 
     def compare(self, candidates: NDArray[np.float64], evaluation: Evaluation, row: int) -> None:
-        """Make one of the candidates in physical units [n, d] the best one if its objective is lower."""
+        """Update the best candidate if one of the candidates in physical units [n, d] has a lower objective."""
         if (value := float(evaluation.value[row])) < self.best_value:
             self.best, self.best_modelled = candidates[row], evaluation.modelled[row]
             self.best_value, self.best_rmse_db = value, float(evaluation.rmse_db[row])
@@ -223,7 +224,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     """
     engine, trail = problem.engine, Trail()
     started, calls, hits = time.perf_counter(), engine.calls, _hits(engine)
-    # A method that uses residuals but no derivatives models each residual, so it needs the full ones.
+    # A method that uses residuals but no derivatives models each residual, so it needs the full residuals.
     needs_all_residuals = "residuals" in optimizer.uses and not optimizer.needs_derivatives()
     evaluate = problem.evaluate if needs_all_residuals else problem.squares
     for iteration, (points, evaluation) in enumerate(rounds(optimizer, evaluate), start=1):
@@ -239,7 +240,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
     if not (problem.differentiable or problem.observed):
-        # The engine was called for the initial values before the search, so they are compared as well.
+        # The engine was called for the initial values before the search, so these values are compared as well.
         start = problem.parameters.start[None]
         answer = Responses(problem.before[None], np.zeros((1, 0, problem.num_links)))
         trail.compare(start, problem.judge(start, answer), 0)
@@ -258,12 +259,12 @@ def _hits(engine: Engine) -> int:
 
 
 def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Collect the known minima of a problem; search for further minima if the method kept only its best one.
+    """Collect the known minima of a problem; search for further minima if the method kept only its best minimum.
 
-    Returns points of the search space, the calibrated one first [k, d], and their mean squares [k].
+    Returns points of the search space, with the calibrated point first [k, d], and their mean squares [k].
     """
     points = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
-    # The calibrated point and the optimizer's best one are the same minimum.
+    # The calibrated point and the optimizer's best point are the same minimum.
     if len(points) <= 2:
         points = np.concatenate([points, least_squares(problem, SEARCHES, points).minima])
     return points, problem.squares(points).value ** 2
