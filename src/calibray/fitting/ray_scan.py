@@ -33,7 +33,7 @@ from calibray.materials import Material
 from calibray.paths import Kind, Paths
 
 CONDUCTIVITIES: Final = 10.0 ** np.arange(-3.5, 1.1, 0.5)
-"""Conductivities of a scan [S/m]; a local search covers the half decade between neighboring values."""
+"""Conductivities of a scan [S/m]; a local search covers the half decade between adjacent values."""
 
 THINNEST: Final = 1e-3
 """Minimum thickness in a scan [m]."""

@@ -45,22 +45,22 @@ from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterio
 from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_intervals, verdicts, with_reason
 
 LARGEST_ERROR: Final = 0.5
-"""Intervals are drawn if the emulator's error at left-out calls is at most this share of the best call's RMSE. With
-larger errors, candidates near a call fit better only because the emulator is exact there. Without this limit, the
-intervals of parameters judged identified or weakly identified contained 2 of 7 true values with 2 calls per parameter,
-and 14 of 14 with 8 or 16 (docs/measurements/intervals.md)."""
+"""Intervals are drawn only if the emulator's leave-one-out error is at most this fraction of the best call's RMSE. With
+larger errors, candidates near a call fit better only because the emulator is exact at the calls. Without this limit,
+the intervals of parameters judged identified or weakly identified contained 2 of 7 true values for runs with 2 calls
+per parameter. For runs with 8 or 16 calls per parameter, they contained 14 of 14 (docs/measurements/intervals.md)."""
 
 NEGLIGIBLE_DB: Final = 0.05
 """An emulator error up to this value is always accepted [dB]; path loss is not measured more precisely."""
 
 DRAWS_PER_CALL: Final = 40
-"""Number of evaluations, per call of the calibration, that larger populations may use if small populations disagree. A
+"""Number of evaluations per calibration call that larger populations may use if small populations disagree. A
 call with derivatives takes as long as 10 to 16 of these evaluations. Populations of 64 members disagreed in 8 of 24
-runs in districts 100 to 106. With 256 members instead, the share of the posterior that the worst 90 % set contains rose
-from 0.76 to 0.80, on average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
+runs in districts 100 to 106. With 256 members instead, the worst 90 % set contained 0.80 of the posterior instead of
+0.76, on average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
 
 EQUAL: Final = 0.1
-"""If the drawn emulators differ from their mean by less than this share of the lowest objective, only the mean is
+"""If the drawn emulators differ from their mean by less than this fraction of the lowest objective, only the mean is
 used."""
 
 KEPT_DRAWS: Final = 128
@@ -73,25 +73,25 @@ MAX_LINKS: Final = 100_000
 """Number of links above which no draws are made, because whitening correlated errors would take minutes."""
 
 MAX_COLUMNS: Final = 100
-"""Largest number of nuisance columns for which the draws include the coefficients."""
+"""Maximum number of nuisance columns for which the draws include the coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""The credible set for the measured buildings is reported if it differs from the set for all buildings over more than
-this share of the range that the two sets span together."""
+"""The credible set for the measured buildings is reported if it differs sufficiently from the set for all buildings.
+They must differ over more than this fraction of the range that both sets span together."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
 """Usual widths of parameter ranges: building materials have permittivities between 2 and 12, and conductivities that
-span three decades. Verdicts refer to these widths, so wider bounds do not improve a verdict."""
+span three decades. Verdicts refer to these widths, so that wider bounds do not improve a verdict."""
 
 EXACT_DB: Final = 1e-6
-"""RMSE below which the data are treated as free of noise, and linear theory as exact [dB]."""
+"""RMSE below which the data are treated as noise-free, and linear theory is treated as exact [dB]."""
 
 FEWEST_DRAWS: Final = 30
-"""Smallest number of effective draws for which standard deviations are compared; their uncertainty is then 13 %."""
+"""Minimum number of effective draws for comparing standard deviations, whose uncertainty is then 13 %."""
 
 NOTABLE_SHARE: Final = 0.85
-"""Largest share that is reported; larger shares may be due to chance, because a standard deviation from few draws is
-uncertain."""
+"""Maximum remaining fraction of an interval's width that is reported. Larger fractions may be due to chance, because a
+standard deviation from few draws is uncertain."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +116,11 @@ def certainty(
 ) -> Certainty:
     """Assess the uncertainty of a calibration from its finished search.
 
-    `model` is the replay of the study's scene, if the search used one as a cheap model. The stages of `progress` are
+    `model` is the replay of the study's scene, if the search used it as a cheap model. The stages of `progress` are
     "finding minima", "drawing" and "judging intervals".
     """
     started = time.perf_counter()
-    # With few links, matrices are small, and BLAS threads cost more time than they save.
+    # With few links, the matrices are small, so BLAS threads cost more time than they save.
     with single_blas_thread(problem.objective.num_counted <= FEW_LINKS):
         if problem.differentiable:
             before = problem.engine.calls
@@ -136,7 +136,7 @@ def certainty(
 def _assess_emulated(
     problem: Problem, trail: Trail, progress: Progress | None, model: ReplayedModel | None
 ) -> tuple[Certainty, int]:
-    """Uncertainty from emulators of an engine without derivatives, and the number of replays."""
+    """Uncertainty from emulators of an engine without derivatives, and the number of replays made."""
     ensemble, name = emulate(problem, trail, model), problem.setup.study.engine.name
     error_db = np.inf if ensemble is None else float(ensemble.error_db)
     if ensemble is None or error_db > max(LARGEST_ERROR * trail.best_value, NEGLIGIBLE_DB):
@@ -186,7 +186,7 @@ def _approximate(intervals: dict[str, Interval]) -> dict[str, Interval]:
 def _assess(
     problem: Problem, engines: Sequence[Problem], trail: Trail, progress: Progress | None
 ) -> Certainty:
-    """Uncertainty of a problem, from draws for `engines`: copies of the problem with equally likely engines."""
+    """Uncertainty of a problem, from draws for `engines`: copies of the problem, each with an equally likely engine."""
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
@@ -254,7 +254,7 @@ def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None, ca
 
 
 def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> dict[str, float]:
-    """Posterior weight of each kind of noise, of differing buildings, and of an undeclared offset."""
+    """Posterior weight of each kind of noise, of differences between buildings, and of an undeclared offset."""
     models, weight = model.marginal.models, posterior.means.weight
     weights = {kind: 0.0 for kind in dict.fromkeys(each.kind for each in models)}
     by_model = np.bincount(posterior.model, weight, len(models))
@@ -309,7 +309,7 @@ def _intervals(
 
 
 def _differ(verdict: JudgedSet) -> bool:
-    """Whether the sets for measured and for all buildings differ over more than a tenth of their common hull."""
+    """Whether the sets for the measured buildings and for all buildings differ by more than `SHOWN_DIFFERENCE`."""
     both = (np.array(verdict.pieces), np.array(verdict.seen))
     line = np.linspace(min(each.min() for each in both), max(each.max() for each in both), 1000)
     one, other = (((each[:, :1] <= line) & (line <= each[:, 1:])).any(axis=0) for each in both)
@@ -325,7 +325,8 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
     values[:, : len(model.study)] = model.study.from_search(draws.point[kept])
     by_name = dict(zip(parameters.names, values.T.tolist(), strict=True))
     if 0 < len(nuisance.columns) <= MAX_COLUMNS:
-        # Given the parameters, coefficients scatter about their best values; undetermined ones do not.
+        # For given parameters, determined coefficients scatter about their best values; undetermined coefficients do
+        # not.
         objective = replace(problem.objective, noise_db=model.marginal.noise_db)
         normal = random.standard_normal((len(values), len(nuisance.columns)))
         scatter = np.where(objective.determined, normal @ objective.coefficient_root().T, 0.0)
@@ -336,12 +337,12 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
 
 
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
-    """For each parameter of the study, the share of its interval's width that remains without each cause.
+    """For each parameter of the study, the fraction of its interval's width that remains without each cause.
 
-    Draws in which a cause is absent, for example those with equal buildings, are draws from the posterior of a study
-    that rules this cause out. The effect of the constants that the scene fixes is removed by linear regression of the
-    parameter on these constants. The share that remains is an upper bound, because the true dependence may be
-    nonlinear. Only causes that noticeably widen an interval are listed, in ascending order of the shares.
+    Draws in which a cause is absent, such as draws with equal buildings, are draws from the posterior of a study that
+    excludes this cause. The effect of the constants that the scene fixes is removed by linear regression of the
+    parameter on these constants. The remaining fraction is an upper bound, because the true dependence may be
+    nonlinear. Only causes that noticeably widen an interval are listed, in ascending order of the fractions.
     """
     draws, width = posterior.means, len(model.study)
     models = [model.marginal.models[index] for index in posterior.model]
@@ -386,20 +387,21 @@ def _effective(weight: NDArray[np.float64]) -> float:
 
 
 REPEAT_M: Final = 0.01
-"""Largest distance between the ends of two rows that count as repeats of one link [m]; antennas are larger."""
+"""Maximum distance between the link ends of two rows that count as repeats of one link [m]; antennas are larger than
+this."""
 
 REPEAT_DB: Final = 0.1
-"""Largest difference in modelled path loss between such rows [dB]; a different antenna or carrier changes it by
-more."""
+"""Maximum difference in modelled path loss between two rows that repeat a link [dB]; a different antenna or carrier
+frequency changes path loss by more than this."""
 
 
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
-    """Replace the rows that repeat a link by their mean; the problem is unchanged if no row repeats a link.
+    """Replace the rows that repeat a link with their mean; the problem is unchanged if no row repeats a link.
 
-    Rows at the same position share the link's error. If they were treated as independent, intervals would be too narrow
-    by a factor of the square root of the number of rows. The scatter of the rows contains no information about the
-    shared error. If the rows agree closely, a noise model with one variance for scatter and shared error would
-    underestimate the shared error.
+    Rows at the same position share the link's error. If these rows were treated as independent, intervals would be too
+    narrow by the square root of the number of rows. The scatter of the rows contains no information about the shared
+    error. If the rows agree closely, a noise model with one variance for scatter and shared error would underestimate
+    the shared error.
 
     Rows repeat a link if they have the same end positions, nuisances and biases, and if their modelled path losses
     agree, both at the initial values and at the best candidate. The first row is assigned the mean path loss, the mean
@@ -420,7 +422,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     parameters = problem.parameters
     candidates = np.stack([parameters.to_search(best), parameters.to_search(parameters.start)])
     terms = objective.nuisance.terms
-    # Columns in units of the largest difference that repeats may have; different groups differ by 2 or more.
+    # Scale the columns by the maximum difference between repeats; different groups then differ by 2 or more.
     columns = np.array([
         *np.nan_to_num(problem.modelled(candidates)[:, counted] / REPEAT_DB),  # inf without a path
         *(term.value[counted] / 1e-3 for term in terms),
@@ -430,7 +432,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     first = np.full(len(counted), -1)
     for row in range(len(counted)):
         if first[row] < 0:
-            # All later rows that agree with a first row repeat its link.
+            # All later rows that agree with the first row repeat the same link.
             near = np.array(tree.query_ball_point(position[row], REPEAT_M))
             equal = (np.abs(columns[:, near] - columns[:, [row]]) <= 1.0).all(axis=0) & (first[near] < 0)
             first[near[equal]] = row
@@ -451,7 +453,7 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
 def _means(
     values: NDArray[np.float64], counted: NDArray[np.int64], first: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Values [L] with the mean of each link's known values in the link's first row; NaN if no value is known.
+    """Copy of the values [L] with the mean of a link's known values in its first row; NaN if no value is known.
 
     For each of the m rows with nonzero weight, `first` is the index of the first row of the same link [m].
     """

@@ -1,4 +1,4 @@
-"""Replay in which further constants vary: constants of individual buildings, and constants that the scene fixes.
+"""Replay in which further constants vary: those of individual buildings, and those that the scene fixes.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each
 combination of a building and a material becomes a separate material.
@@ -28,19 +28,20 @@ from calibray.paths import Paths
 from calibray.scenes import Scene, building_numbers, read_triangles
 
 BATCHES: Final = (1, 128)
-"""Smallest and largest number of candidates per replay."""
+"""Minimum and maximum number of candidates per replay."""
 
 BATCH_INTERACTIONS: Final = 400_000
-"""Target for the number of interactions of one replay over all its candidates. Larger programs are replayed with fewer
-candidates at a time."""
+"""Target for the total number of interactions of one replay, summed over its candidates. Larger path programs are
+replayed with fewer candidates at a time."""
 
 MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
 
 WEAK: Final = 0.1
-"""Largest share of a link's power, summed over 16 candidates, that all omitted paths together may carry. On an office
-floor in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05 dB
-(RMS); the errors are 5.3 dB. With a share of 0.03, 61 % are left out, and the change is 0.02 dB."""
+"""Maximum fraction of a link's power, summed over 16 candidates, that all omitted paths together may carry. On an
+office floor in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05
+dB (RMS); the errors are 5.3 dB. With a fraction of 0.03, 61 % of the interactions are left out, and the change is 0.02
+dB."""
 
 EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
 """Fields of parameters that are exponents in frequency laws."""
@@ -51,9 +52,10 @@ class _Part:
     """The replay of one carrier.
 
     Attributes:
-        engine: The replay; each of its k parameters is a constant of one building, or of all objects.
+        engine: The replay; each of its k parameters is a constant of one building or of all objects.
         links: Indices of its links.
-        constants: Indices of its constants among those of all carriers [k]; empty if its paths depend on none.
+        constants: Indices of the part's constants among the constants of all carriers [k]; empty if the paths depend on
+            no constant.
     """
 
     engine: Replay
@@ -61,7 +63,7 @@ class _Part:
     constants: NDArray[np.intp]
 
     def respond(self, constants: NDArray[np.float64], wanted: tuple[Statistic, ...]) -> Responses:
-        """Path loss and further observables for all constants [n, c], which are clipped to their physical bounds."""
+        """Path loss and further observables for given constants [n, c], which are clipped to physical bounds."""
         parameters = self.engine.parameters
         candidates = np.tile(parameters.start, (len(constants), 1))
         if len(self.constants):
@@ -91,7 +93,7 @@ class Split(ABC):
 
     @property
     def keys(self) -> NDArray[np.int64]:
-        """A number that encodes the parameter and the building of each constant, ascending [c]."""
+        """Numbers that encode the parameter and the building of each constant, in ascending order [c]."""
         # Building -1 comes just before building 0 of the same parameter.
         return (self.parameter_of << 32) + self.building_of
 
@@ -103,7 +105,7 @@ class Split(ABC):
     def respond(
         self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Responses:
-        """Path loss and the observables in `wanted`, if any; the other arguments are as for `path_loss`."""
+        """Path loss and the observables in `wanted`; the other arguments are as for `path_loss`."""
 
 
 @final
@@ -133,11 +135,11 @@ class SplitReplay(Split):
 @final
 @dataclass(frozen=True, eq=False)
 class SplitChunks(Split):
-    """A split replay of links in chunks. Every worker splits the replays of its chunks and keeps the results.
+    """A split replay of links in chunks. Every worker splits the replays of its chunks and stores the results.
 
     Attributes:
         engine: The chunks.
-        splitting: The settings for splitting their replays.
+        splitting: The settings that the workers use to split the replays.
     """
 
     engine: Chunked
@@ -153,7 +155,7 @@ class SplitChunks(Split):
 
 @dataclass(frozen=True)
 class _Splitting:
-    """Settings for splitting replays; they can be pickled. Equal settings split a replay in the same way.
+    """Settings for splitting replays; the settings can be pickled. Equal settings split a replay in the same way.
 
     Attributes:
         parameters: The study's parameters and further constants.
@@ -181,7 +183,7 @@ class _Splitting:
                 building = _interaction_buildings(paths, study.scene)
             met |= set(building[building >= 0].tolist())
             splits.append((*_split_paths(study.radio, replay, paths, building, self.parameters), links))
-        # Sorted by the index of the parameter, then by building.
+        # Sorted by parameter index, then by building.
         constants = sorted({key for _, keys, _ in splits for key in keys})
         number = {key: index for index, key in enumerate(constants)}
         parts = tuple(
@@ -228,8 +230,9 @@ def replayed_materials(problem: Problem) -> list[dict[str, Material]]:
 def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> Split:
     """Add further parameters to a problem's replay and, if `by_building`, separate constants for each building.
 
-    `can_split` must be true for the problem. The study's parameters come first; a further parameter is a constant that
-    is equal at all carriers. If the paths interact with fewer than two buildings, no constant belongs to a building.
+    `can_split` must be true for the problem. The study's parameters come first; each further parameter is a constant
+    with one value for all carriers. If the paths interact with fewer than two buildings, no separate constants are
+    added for buildings.
     """
     engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
     # Weak paths often arrive late, and delay spreads depend on late paths, so further observables need all paths.
@@ -248,7 +251,7 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
 def _split_paths(
     radio: RadioSettings, replay: Replay, paths: Paths, building: NDArray[np.int64], parameters: Parameters
 ) -> tuple[Replay, list[tuple[int, int]]]:
-    """The replay of one carrier with the given paths, and the parameter and building (-1: none) of each constant.
+    """The replay of one carrier with the given paths, and each constant's parameter and building (-1 for none).
 
     If the paths depend on no constant, the replay is unchanged and the list is empty.
     """
@@ -260,9 +263,10 @@ def _split_paths(
     items, keys = [], []
     at_carrier, constant_of = parameters.at_carrier(paths.frequency)
     for constant_index, constant in enumerate(at_carrier):
-        # Both coefficients of a law set one constant.
+        # Both coefficients of a frequency law determine one constant.
         setting = np.flatnonzero(constant_of == constant_index).tolist()
-        # A building's factor multiplies the constant, or the coefficient of its law; buildings share one exponent.
+        # A building's factor multiplies the constant or the coefficient of its frequency law; all buildings share the
+        # exponent.
         scaling = [index for index in setting if parameters.items[index].field not in EXPONENTS]
         index = (scaling or setting)[0]
         if constant.is_effect:
@@ -288,7 +292,7 @@ def _split_paths(
     return split, keys
 
 
-# Functions that are sent to the workers of chunks.
+# Functions that are sent to the workers.
 
 
 def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
@@ -309,13 +313,13 @@ def _chunk_respond(
     factors: NDArray[np.float64],
     wanted: tuple[Statistic, ...],
 ) -> Responses:
-    """The responses of a chunk; `factors` belong to the constants with the given keys."""
+    """The responses of a chunk; `factors` contains the factors of the constants with the given keys."""
     split = chunk.derived(splitting)
     return split.respond(values, factors[:, np.searchsorted(keys, split.keys)], wanted)
 
 
 def _interaction_buildings(paths: Paths, scene: Scene) -> NDArray[np.int64]:
-    """Building of every interaction [I]; -1 for an interaction with a material of the ground."""
+    """Building of every interaction [I]; -1 for an interaction with a ground material."""
     triangles = read_triangles(scene)
     ground_names = [list(scene.materials)[k] for k in np.unique(triangles.material[triangles.ground])]
     building = building_numbers(triangles, np.asarray(paths.vertex, dtype=np.float64))

@@ -15,8 +15,8 @@ class Draws:
 
     Attributes:
         point: The points [n, d].
-        density: Log posterior at the points, up to a constant [n].
-        weight: Their weights, which sum to one [n].
+        density: Log posterior density at the points, up to a constant [n].
+        weight: Weights of the points, which sum to one [n].
         agree: Whether the independent populations of the sampler agree.
     """
 
@@ -44,7 +44,7 @@ def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
 def systematic_resampling(
     weight: NDArray[np.float64], count: int, random: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draw ascending indices [count] by weights [n], at evenly spaced quantiles with a common random shift."""
+    """Draw indices [count], in ascending order, with given weights [n], by systematic resampling."""
     total = np.cumsum(weight)
     quantile = (np.arange(count) + random.random()) / count * total[-1]
     return np.minimum(np.searchsorted(total, quantile), len(weight) - 1)

@@ -1,11 +1,11 @@
-"""Emulators of an engine without derivatives, made from its calls.
+"""Emulators of an engine without derivatives, fitted to its calls.
 
 Intervals require thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
 interpolates the calls (`multifidelity/discrepancy.py`). The mean of the process is the corrected replay of the study's
-scene if it is available and not misleading, and otherwise a constant. The uncertainty of the process must widen the
-intervals. We therefore draw functions from the process, use each function as an engine, and pool the resulting
-posteriors. Each call is also predicted from all the others. If the errors of these predictions exceed the expected
-errors, the spread of the drawn functions is increased by the same factor.
+scene if such a replay is available and not misleading; otherwise it is a constant. The uncertainty of the process must
+widen the intervals. We therefore draw functions from the process, use each function as an engine, and pool the
+resulting posteriors. Each call is also predicted from all other calls. If the errors of these predictions exceed the
+expected errors, the spread of the drawn functions is increased by the same factor.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ FUNCTIONS: Final = 8
 """Number of functions drawn."""
 
 MAX_CALLS: Final = 200
-"""Largest number of calls that the process interpolates; its matrix is factored about a hundred times."""
+"""Maximum number of calls that the process interpolates; its covariance matrix is factored about a hundred times."""
 
 NEAR: Final = 0.005
-"""If there are more than `MAX_CALLS` calls, only the better of two calls that are closer together than this in the unit
-cube is used."""
+"""If there are more than `MAX_CALLS` calls and two calls are closer together than this in the unit cube, only the
+better call is used."""
 
 
 class MeanFunction(Protocol):
-    """The mean of the Gaussian process: path loss predicted without calls."""
+    """The mean of the Gaussian process, which predicts path loss without calls."""
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
         """Path loss [k, m] at points of the unit cube [k, d], and the inputs of the process."""
@@ -61,7 +61,7 @@ class MeanFunction(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ConstantMean:
-    """A constant mean with linear responses, used if there is no replay.
+    """A constant mean with linear responses, which is used if there is no replay.
 
     Attributes:
         centre: Mean of each emulated row over the calls [m], [dB].
@@ -86,7 +86,8 @@ class ConstantMean:
 class ResponseRows:
     """The emulated rows, which replace the residuals: path loss of links with nonzero weight, then further observables.
 
-    Further observables are divided by their errors and multiplied by that of path loss, so all rows are comparable.
+    Further observables are divided by their error and multiplied by the error of path loss, so that all rows are
+    comparable.
 
     Attributes:
         problem: The problem.
@@ -141,7 +142,7 @@ class ResponseRows:
         return [each.used(self.problem.objective.weight) for each in self.problem.observed]
 
     def unit(self, index: int) -> float:
-        """Factor that converts scaled values of an observable to rows."""
+        """Factor that converts scaled values of an observable to emulated rows."""
         return self.problem.objective.noise_db / self.problem.observed[index].std
 
 
@@ -149,8 +150,8 @@ class Calls(NamedTuple):
     """The calls of an engine.
 
     Attributes:
-        unit: Distinct points, in the unit cube [n, d].
-        rows: Their rows of `ResponseRows` [n, m].
+        unit: Distinct points in the unit cube [n, d].
+        rows: Emulated rows at the points, as in `ResponseRows` [n, m].
         value: Objective [n].
     """
 
@@ -170,7 +171,7 @@ class EmulatedEngine:
         mean: The mean function.
         function: The function added to the mean.
         rows: The definition of the m emulated rows.
-        initial_loss: Path loss of all links at the initial values [L], [dB]; it is returned for links that are not
+        initial_loss: Path loss of all links at the initial values [L], [dB], which is returned for links that are not
             emulated.
         calls: Number of candidates evaluated so far.
     """
@@ -208,7 +209,7 @@ class EmulatedEngine:
             return Responses(*self._for_all_links(base + self.function.values(inputs), wanted))
         base, slope, inputs, change = self.mean.base_and_slope(unit)
         box, scale = self._box, self.parameters.search_slope(candidates)
-        # Derivatives with respect to the physical values instead of the unit cube's coordinates.
+        # Convert to derivatives with respect to physical values instead of unit-cube coordinates.
         slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
         links, last = self.rows.links, len(self.rows.links)
         loss_slope = np.zeros((count, len(self.initial_loss), box.dimension))
@@ -237,7 +238,7 @@ class EmulatedEngine:
     def _further(
         self, rows: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> Iterator[tuple[Observed, NDArray[np.int64], NDArray[np.float64]]]:
-        """Each further observable, the links with a value, and its part of the emulated rows [n, m, ...]."""
+        """Yield each further observable, its links with a value, and its part of the emulated rows [n, m, ...]."""
         first = len(self.rows.links)
         every = self.rows.problem.observed if wanted else ()
         for each, used in zip(every, self.rows.used, strict=False):
@@ -252,10 +253,10 @@ class Ensemble:
     Attributes:
         mean: The posterior mean of the process.
         drawn: Functions drawn from the process.
-        apart_db: Root mean square difference between drawn functions and the mean over the unit cube [dB].
-        error_db: Root mean square leave-one-out error of the better half of the calls [dB].
+        apart_db: RMS difference, over the unit cube, between the drawn functions and the mean [dB].
+        error_db: RMS leave-one-out error of the better half of the calls [dB].
         calls: Number of calls that the process interpolates.
-        replayed: The corrected replay in the mean function; None if there is none, or if it is misleading.
+        replayed: The corrected replay in the mean function; None if there is no replay or the replay is misleading.
     """
 
     mean: EmulatedEngine
@@ -272,7 +273,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     box, rows = Box(*parameters.search_bounds), ResponseRows(problem, np.flatnonzero(objective.weight > 0))
     calls = _calls(problem, trail, box, rows)
     random, noisy = np.random.default_rng([method.seed, 8]), bool(method.options.get("noisy", False))
-    # The replay with the emulated rows as its residuals, if it predicts any row.
+    # Use the replay with the emulated rows as its residuals, if it predicts any of these rows.
     replayed = None if model is None else ReplayedModel(model.engine, model.count, rows)
     replayed = replayed if replayed is not None and replayed.known.any() else None
     corrected = None
@@ -292,7 +293,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     else:
         return None
     better = np.argsort(calls.value, kind="stable")[: max(2, len(calls.value) // 2)]
-    # If leave-one-out errors exceed the expected ones, the spread of the drawn functions grows by the same factor.
+    # If leave-one-out errors exceed the expected errors, increase the spread of the drawn functions by the same factor.
     stretch = max(
         1.0, standardized_error(process, better), standardized_error(process, np.arange(len(calls.value)))
     )
@@ -318,11 +319,11 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with a path loss for every link with nonzero weight; above `MAX_CALLS`, the best and some others."""
+    """The calls with path loss for every link with nonzero weight; beyond `MAX_CALLS` calls, a selection of them."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)
-    # The problem keeps path loss at the initial values, but no observables.
+    # The problem stores path loss at the initial values, but no observables.
     if not problem.observed:
         candidates = np.vstack([candidates, parameters.start])
         modelled = np.vstack([modelled, problem.before])
@@ -343,7 +344,7 @@ def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Call
         for index in order.tolist():
             if not distinct or np.abs(unit[distinct] - unit[index]).max(axis=1).min() > NEAR:
                 distinct.append(index)
-        # The best calls, and an evenly spaced selection of the others.
+        # Keep the best calls and an evenly spaced selection of the others.
         half = MAX_CALLS // 2
         best, others = np.array(distinct[:half], dtype=np.int64), np.array(distinct[half:], dtype=np.int64)
         if len(others):

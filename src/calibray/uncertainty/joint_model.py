@@ -1,19 +1,19 @@
 """The joint model of all unknowns: parameters, fixed constants, buildings and errors.
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
-- Constants that the scene fixes for the calibrated materials, such as thickness, are never known exactly. They have a
-  log-normal prior around the scene's value. A scattering coefficient of 0 is taken as exact with a probability of one
-  half.
+- Constants that the scene fixes for the calibrated materials, such as thickness, are not known exactly. They have a
+  log-normal prior around the scene's value. A scattering coefficient of 0 is assumed to be exact with a probability of
+  one half.
 - A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
-  between-building spread s is zero with probability `ALIKE`, and otherwise exponentially distributed.
+  between-building spread s is zero with probability `ALIKE`; otherwise it is exponentially distributed.
 - Errors follow one of several noise models (`noise_models.py`). The noise level, the nuisances and an undeclared offset
   are integrated out.
 
 `sequential_monte_carlo.py` draws from the posterior.
 
-Under Gaussian noise, correlated or not, the density with noise level and nuisance integrated out is a power of a
-quadratic form of the gaps. The matrix of this form is computed once, unless there are many links. Under heavy tails,
-gaps with and without an offset are evaluated together.
+For Gaussian noise, correlated or not, integrating out the noise level and the nuisance gives a density that is a power
+of a quadratic form of the gaps. The matrix of this form is computed once, unless there are many links. For heavy-tailed
+noise, gaps with and without an offset are evaluated together.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from calibray.uncertainty.buildings import can_split, replayed_materials, split_
 from calibray.uncertainty.noise_models import HEAVY, Marginal, excess_db, noise_models
 
 MAX_LINKS: Final = 300
-"""Number of links up to which the matrices are stored; those of 26 Gaussian models then occupy 19 MB."""
+"""Maximum number of links for which the matrices are stored; the matrices of 26 Gaussian models then occupy 19 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class QuadraticForms:
-    """A marginal density, prepared for gaps that each have their own noise model.
+    """A marginal density, prepared for gaps each of which has its own noise model.
 
     Attributes:
         marginal: The density.
         group: Group of each model; models of one group are evaluated together [models]. It is -1 for Student's t, -2
             for gross errors, and otherwise the model's own index.
         square: For each Gaussian model, the matrix [m, m], constant and exponent of its quadratic form; None for other
-            models. Empty if there are too many links or any censored links.
+            models. Empty if there are too many links or if any link is censored.
     """
 
     marginal: Marginal
@@ -94,20 +94,20 @@ class QuadraticForms:
         return log_density + log_weight
 
     def _without_form(self, gap: NDArray[np.float64], index: int) -> NDArray[np.float64]:
-        """Log density [n] of gaps [n, m] under the model with an index, without its weight or quadratic form."""
+        """Log density [n] of gaps [n, m] under the model `index`, without the model's weight."""
         model = replace(self.marginal.models[index], weight=1.0)
         return replace(self.marginal, models=(model,)).densities(gap)[:, 0]
 
 
 FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
-"""Constants that come from the scene if they are not parameters."""
+"""Material constants that are taken from the scene if they are not parameters."""
 
 NO_EFFECT: Final = 0.02
-"""A constant from the scene stays fixed if a change by one standard deviation changes path loss by less than this share
-of the noise level. The variance that it would add is then below 0.04 % of the noise variance."""
+"""A constant from the scene stays fixed if a change by one standard deviation changes path loss by less than this
+fraction of the noise level. The variance that the constant would add is then below 0.04 % of the noise variance."""
 
 ALIKE: Final = 0.5
-"""Prior probability that buildings do not differ."""
+"""Prior probability that all buildings have equal constants."""
 
 MEAN_SPREAD: Final = 0.15
 """Mean of the exponential prior of the between-building spread if buildings differ."""
@@ -116,17 +116,17 @@ SPREAD_BOUNDS: Final = (0.004, 0.8)
 """Range of the between-building spread if buildings differ."""
 
 GRID: Final = 2001
-"""Number of points over the range of a parameter at which its prior is tabulated."""
+"""Number of points at which the prior of a parameter is tabulated over its range."""
 
 
 Gaps = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""Maps points of the unit cube [n, d + k] and logarithms of the factors on buildings' constants [n, c] to gaps [n, m],
-[dB]. A gap is measured minus modelled path loss, without the nuisance, times the square root of the link's weight."""
+"""Maps points of the unit cube [n, d + k] and the log factors of the buildings' constants [n, c] to gaps [n, m], [dB].
+A gap is measured minus modelled path loss, without the nuisance, times the square root of the link's weight."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointModel:
-    """The joint model. Points are in the unit cube of the model's parameters.
+    """The joint model of all unknowns; its points are in the unit cube of its parameters.
 
     Attributes:
         study: The study's d parameters.
@@ -137,13 +137,13 @@ class JointModel:
         marginal: The density of the gaps under every noise model.
         parameter_of: Index of the parameter to which each of the c constants of individual buildings belongs [c].
         building_of: Index of the building of each of these constants [c].
-        only_buildings: Indices of the parameters whose constants all belong to buildings; the buildings alone determine
-            the mean.
+        only_buildings: Indices of the parameters whose constants all belong to buildings, so that the buildings alone
+            determine the mean.
         spread: The between-building spread if the study declares it; otherwise None.
         interactions: Number of interactions per evaluation.
-        effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
+        effects_db: Change in path loss for a change of each fixed constant by one standard deviation [dB].
         observed: For each further observable, the number of its rows, its degrees of freedom, and whether its rows are
-            in units of a stated error. The rows follow the m gaps of path loss.
+            in units of a stated error. These rows follow the m gaps of path loss.
     """
 
     study: Parameters
@@ -180,20 +180,21 @@ class JointModel:
         links, further = gaps[:, :last], np.zeros(len(gaps))
         for count, freedom, stated in self.observed:
             square = np.sum(gaps[:, last : last + count] ** 2, axis=1)
-            # A stated error is the unit of the rows. Otherwise the integral over it is square^(-freedom / 2).
+            # A stated error is the unit of the rows. Otherwise the integral over the error is square^(-freedom / 2).
             further += -0.5 * square if stated else -0.5 * freedom * np.log(np.maximum(square, 1e-300))
             last += count
         return links, further
 
     @cached_property
     def forms(self) -> QuadraticForms:
-        """The density of gaps, each under its own noise model."""
+        """The density of the gaps, each under its own noise model."""
         return QuadraticForms.of(self.marginal)
 
     def at_scene_constants(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log posterior [n] at points of the study's search space [n, d], up to a constant.
 
-        Buildings are equal, and further constants have the scene's values. The posterior is averaged over noise models.
+        All buildings are equal, and further constants have the scene's values. The posterior is averaged over noise
+        models.
         """
         constants = [item.start for item in self.parameters.items[len(self.study) :]]
         values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
@@ -247,18 +248,18 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     weight, censored = _weights_and_censoring(problem)
     counted = np.flatnonzero(weight > 0)
     weight, censored = weight[counted], censored[counted]
-    # The mean square is one, as in the objective: the noise level refers to a link of mean weight.
+    # As in the objective, the mean square is one, so the noise level refers to a link of mean weight.
     scale = np.sqrt(weight * len(weight) / weight.sum())
     noise_db = float(np.sqrt(square * (freedom + problem.unknowns) / freedom))
     nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
     coefficients = objective.coefficients(problem.modelled(best[None]))[0]
-    # A coefficient at its bound stays there; the others are integrated over the real line.
+    # A coefficient at its bound stays at the bound; the other coefficients are integrated over the real line.
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    # Too few links cannot tell noise models apart or show that buildings differ, so only what the study states is used.
+    # Too few links cannot distinguish noise models or show differences between buildings, so only stated noise is used.
     few = len(counted) < FEW
-    # With correlated errors, the probability of censoring would be an integral over all censored links together.
+    # With correlated errors, the probability of censoring would be a joint integral over all censored links.
     uncorrelated = bool(censored.any()) or (few and section.range_m == "auto")
     out_of_sight = not uncorrelated and section.range_m == "auto"
     models = noise_models(
@@ -315,19 +316,19 @@ def _with_constants(
     best: NDArray[np.float64],
     gap: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> JointModel:
-    """The model with buildings, and with those of the scene's fixed constants that affect path loss."""
+    """Extend the model by the buildings and by the scene's fixed constants that affect path loss."""
     study, known_to = model.study, problem.setup.study.noise.constants_spread
     fixed = _fixed_constants(problem)
     every = replace(study, items=(*study.items, *fixed))
     replay, effects = split_replay(problem, every, by_building=model.spread != 0), {}
 
     def loss_at(values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
-        # Uses the same compiled program as the gaps.
+        # Use the same compiled program as for the gaps.
         return replay.respond(values, factors, problem.statistics).path_loss
 
     if fixed:
         values = np.append(study.from_search(best), [item.start for item in fixed])
-        # In the row of each fixed constant, this constant is larger by one standard deviation.
+        # Each row increases one fixed constant by one standard deviation.
         one = np.eye(len(values))[len(study) :]
         larger = values * np.exp(known_to * one) + SCATTERING_SPREAD * one * (values == 0)
         alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
@@ -341,12 +342,12 @@ def _with_constants(
     index = [every.names.index(name) for name in parameters.names]
 
     def full(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values, with the constants that have no effect inserted."""
+        """The values, completed with the constants that have no effect."""
         all_values = np.tile([item.start for item in every.items], (len(values), 1))
         all_values[:, index] = values
         return all_values
 
-    # Constants that the scene fixes have one value for all buildings.
+    # Constants that the scene fixes have the same value for all buildings.
     of_building = np.flatnonzero((replay.building_of >= 0) & (replay.parameter_of < len(study)))
     parameter_of = replay.parameter_of[of_building]
     constants = np.bincount(replay.parameter_of, minlength=len(every))[: len(study)]
@@ -376,7 +377,7 @@ def _with_constants(
 
 
 def _further(problem: Problem, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Rows of each further observable [n, m], in units of its error if the study states this error."""
+    """Rows of each further observable [n, m], in units of the observable's error if the study states this error."""
     rows = []
     for index, each in enumerate(problem.observed):
         residuals, _ = each.residuals(observed[:, index], problem.objective.weight)
@@ -393,7 +394,7 @@ def has_offset(problem: Problem) -> bool:
 
 
 def _fixed_constants(problem: Problem) -> list[Parameter]:
-    """Constants of materials with a parameter: those that the scene fixes and that are equal at all carriers.
+    """Constants of the calibrated materials that the scene fixes and that are equal at all carrier frequencies.
 
     A scattering coefficient of 0 that the study states is exact for the material and its facades.
     """
@@ -423,14 +424,14 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 
 
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Weights of the links in the likelihood [L], and mask of the censored links [L].
+    """Weights of the links in the likelihood [L], and the mask of the censored links [L].
 
-    With censored links in the likelihood, links measured near the noise floor are also used, so that links are not
-    selected by their measured values.
+    If the likelihood contains censored links, it also contains the links measured near the noise floor, so that links
+    are not selected by their measured values.
     """
     objective, links = problem.objective, problem.setup.links
     if links.censored is None or problem.faint is None:
         return objective.weight, np.zeros(len(links), dtype=bool)
-    # A censored link without a path agrees with the model for any parameters.
+    # A censored link without a path agrees with the model for all parameter values.
     informative = problem.faint & ~problem.setup.held_out & np.isfinite(problem.before)
     return np.where(informative, links.weight, objective.weight), links.censored

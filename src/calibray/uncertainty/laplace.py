@@ -1,4 +1,4 @@
-"""Laplace's approximation of error densities if their integrals over nuisance and scale have no closed form.
+"""Laplace's approximation of error densities whose integrals over nuisance and scale have no closed form.
 
 There are two models of heavy tails. Either the errors follow Student's t, with tails that decrease gradually, or most
 errors are Gaussian and a few are gross, for example because a link's position was recorded incorrectly. Gross errors
@@ -29,7 +29,7 @@ CENSORED_TOLERANCE: Final = 1e-9
 """Predicted gain in log density below which the iteration ends."""
 
 LARGEST: Final = 1e4
-"""Largest magnitude of a censored link's error, in units of the median absolute error. Without this limit, the error of
+"""Maximum magnitude of a censored link's error, in units of the median absolute error. Without this limit, the error of
 a censored link without a path would be infinite."""
 
 
@@ -58,7 +58,7 @@ def log_evidence(
     ridge: NDArray[np.float64],
     freedom: float = np.inf,
 ) -> NDArray[np.float64]:
-    """Log density of errors with censored links, with nuisance and noise level integrated out.
+    """Log density of errors for data with censored links, with nuisance and noise level integrated out.
 
     Args:
         gap: Measured minus modelled path loss; for a censored link, path loss at the floor minus modelled path loss
@@ -82,7 +82,7 @@ def log_evidence(
             break
         trial = np.asarray(point + np.clip(step, -_longest(point), _longest(point)), dtype=np.float64)
         trial_value, trial_slope, trial_curvature = joint(trial, gap, censored, design, ridge, freedom)
-        # Damping as in Levenberg's method: less after a step that raises the density, more otherwise.
+        # As in Levenberg's method, reduce the damping after a step that raises the density, and increase it otherwise.
         better = trial_value > value
         point = np.where(better[:, None], trial, point)
         value = np.where(better, trial_value, value)
@@ -91,7 +91,7 @@ def log_evidence(
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e12)
     has_prior = ridge > 0
     value = value + np.log(ridge[has_prior]).sum() - 0.5 * has_prior.sum() * np.log(2 * np.pi)
-    # Laplace: the density at the mode times (2 pi)^(k/2) |minus the Hessian|^(-1/2), for k = q + 1.
+    # Laplace's approximation: the density at the mode times (2 pi)^(k/2) |minus the Hessian|^(-1/2), with k = q + 1.
     eigenvalues = np.maximum(np.linalg.eigvalsh(curvature), 1e-12)
     return value + 0.5 * point.shape[1] * np.log(2 * np.pi) - 0.5 * np.log(eigenvalues).sum(axis=1)
 
@@ -122,8 +122,8 @@ def joint(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """The joint log density of errors, coefficients and log scale, with its derivatives; see `log_evidence`.
 
-    At coefficients and log scale [n, q + 1], the results are its value up to a constant [n], its gradient [n, q + 1],
-    and its negative Hessian [n, q + 1, q + 1].
+    For coefficients and log scale [n, q + 1], the results are the value of the log density up to a constant [n], its
+    gradient [n, q + 1], and its negative Hessian [n, q + 1, q + 1].
     """
     coefficients, scale = point[:, :-1], np.exp(point[:, -1])
     error = (gap - coefficients @ design.T) / scale[:, None]
@@ -175,18 +175,18 @@ def _damped(curvature: NDArray[np.float64], damping: NDArray[np.float64]) -> NDA
 
 
 def _longest(point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Longest step: three scales for a coefficient, and a factor of e for the scale."""
+    """Maximum step: three scales for a coefficient, and a factor of e for the scale."""
     longest = np.repeat(3.0 * np.exp(point[:, -1:]), point.shape[1], axis=1)
     longest[:, -1] = 1.0
     return longest
 
 
 MAX_STEPS: Final = 25
-"""Largest number of steps to the mode."""
+"""Maximum number of steps to the mode."""
 
 TOLERANCE: Final = 1e-3
-"""Change of errors and scale, relative to the scale, at which the iteration ends. It need not be smaller, because the
-density is flat at the mode."""
+"""Change of errors and scale, relative to the scale, at which the iteration ends. A smaller limit is not needed,
+because the density is flat at the mode."""
 
 GROSS_SHARE: Final = 0.1
 """Share of gross errors."""
@@ -202,11 +202,11 @@ class Tail(NamedTuple):
     """A distribution of errors with unit scale, either the same for all gaps or different for each gap.
 
     Attributes:
-        log_density: Its log density as a function of the squared errors.
+        log_density: Log density as a function of the squared errors.
         weight: Minus the derivative of the log density with respect to half the square; 1 for a Gaussian.
         location: Fisher information of an error about its mean; a number or an array [n].
         size: Fisher information of an error about the logarithm of its scale; a number or an array [n].
-        by_weights: Whether to update the scale with the sum of the weights instead of the number of links, which
+        by_weights: Whether to update the scale with the sum of the weights instead of the number of links; this
             converges faster.
         select: Returns the distributions of the gaps with given indices.
     """
@@ -243,7 +243,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross() -> Tail:
-    """Gaussian errors; a share `GROSS_SHARE` of them has a standard deviation that is `GROSS_RATIO` times as large."""
+    """Gaussian errors; for a fraction `GROSS_SHARE` of them, the standard deviation is `GROSS_RATIO` times larger."""
     share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))
@@ -285,11 +285,11 @@ def evidence(
     links, columns = gap.shape[1], design.shape[1]
     ridge = np.broadcast_to(ridge, (len(gap), columns))
     prior = np.square(ridge)[:, :, None] * np.eye(columns)
-    # Start at a robust scale: 1.2 median absolute deviations, at least 5 % of the root mean square.
+    # Start at a robust scale: 1.2 times the median absolute deviation, but at least 5 % of the root mean square.
     size = np.maximum(np.median(np.abs(gap - np.median(gap, axis=1)[:, None]), axis=1) * 1.2, 1e-9)
     size = np.maximum(size, 0.05 * np.sqrt(np.mean(gap**2, axis=1)) + 1e-12)
     errors, coefficients, size = _mode(gap, design, prior, size, tail)
-    # Log density at the mode, log prior, then Laplace's approximation for the log scale and the coefficients.
+    # Add the log density at the mode, the log prior, and Laplace's term for the log scale and the coefficients.
     value = tail.log_density((errors / size[:, None]) ** 2).sum(axis=1) - links * np.log(size)
     has_prior = ridge > 0
     value += np.log(ridge, where=has_prior, out=np.zeros(ridge.shape)).sum(axis=1)
@@ -315,13 +315,13 @@ def _mode(
     links, columns = design.shape
     outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
     errors, coefficients, change = gap, np.zeros((len(gap), columns)), np.float64(0.0)
-    # Gaps leave the iteration once they have converged; `rows` are those that remain.
+    # Gaps leave the iteration once they have converged; `rows` contains the indices of the remaining gaps.
     mode, rows = (gap.copy(), coefficients.copy(), size.copy()), np.arange(len(gap))
     for step in range(MAX_STEPS):
         variance = size**2
         weight = tail.weight(errors**2 / variance[:, None])
         if columns:
-            # Weighted normal equations, times the variance.
+            # Weighted normal equations, multiplied by the variance.
             matrix = (weight @ outer).reshape(-1, columns, columns) + variance[:, None, None] * prior
             side = (weight * gap) @ design
             coefficients = np.linalg.solve(regular(matrix), side[..., None])[..., 0]

@@ -20,30 +20,30 @@ GRID: Final = 20
 """Number of cells along the longer side of the area."""
 
 SAMPLES: Final = 128
-"""Number of points along each line: enough for several in each cell that the line crosses."""
+"""Number of points along each line, enough for several points in each cell that the line crosses."""
 
 HEIGHTS: Final = (5.0, 10.0, 20.0)
 """Heights of the rectangles' tops above the lowest antenna [m], for hedges, street trees and tall trees."""
 
 FEWEST_LINKS: Final = 30
-"""Smallest number of links for a search."""
+"""Minimum number of links for a search."""
 
 MOST: Final = 20_000
-"""Largest number of links in a search; if there are more, only every kth link is used."""
+"""Maximum number of links in a search; if there are more links, only every kth link is used."""
 
 SHUFFLES: Final = 99
-"""Number of random permutations of the residuals. A rectangle is significant only if no permutation has a rectangle
-that explains as much."""
+"""Number of random permutations of the residuals. A rectangle is significant only if no rectangle explains as much of
+any permutation."""
 
 
 class Explained(NamedTuple):
-    """The best rectangle of one width.
+    """The best rectangle of a given width.
 
     Attributes:
         explained: Sum of squares that the rectangle explains.
         attenuation: Its attenuation [dB/m].
-        cells: Its south-west and north-east corners, in cells [2, 2].
-        chance: Sum of squares that the best rectangle of this width explains, for each permutation [k - 1].
+        cells: South-west and north-east corners of the rectangle, in cells [2, 2].
+        chance: Sum of squares that the best rectangle of this width explains for each permutation [k - 1].
     """
 
     explained: float
@@ -57,13 +57,14 @@ class MissingRegion:
     """A rectangle with an extra loss that would explain part of the residuals.
 
     Attributes:
-        box: Coordinates of its west, south, east and north sides in the scene frame [m].
-        height: Height of its top in the scene frame [m].
+        box: Coordinates of the west, south, east and north sides in the scene frame [m].
+        height: Height of the top of the rectangle in the scene frame [m].
         attenuation: Loss per length inside [dB/m].
-        links: Number of links whose straight line crosses it; an estimate if not all links are used.
-        share: Share of the mean square of the residuals that it explains.
-        chance: Median share of the mean square that the best rectangle explains if the residuals are permuted.
-        significant: Whether at least `FEW` links cross it, and no permutation has a rectangle that explains as much.
+        links: Number of links whose straight line crosses the region; an estimate if not all links are used.
+        share: Fraction of the mean square of the residuals that the rectangle explains.
+        chance: Median fraction of the mean square that the best rectangle explains if the residuals are permuted.
+        significant: Whether at least `FEW` links cross the region, and no rectangle explains as much of any
+            permutation.
     """
 
     box: tuple[float, float, float, float]
@@ -75,7 +76,7 @@ class MissingRegion:
     significant: bool
 
     def row(self) -> dict[str, Any]:
-        """The values by name; the four sides of the box are separate values."""
+        """The attributes by name, with the four sides of the box as separate values."""
         sides = dict(zip(("west", "south", "east", "north"), self.box, strict=True))
         return sides | {name: value for name, value in asdict(self).items() if name != "box"}
 
@@ -92,7 +93,8 @@ def missing_region(
         tx: Positions of the transmitters [n, 3], [m].
         rx: Positions of the receivers [n, 3], [m].
         excess_db: Measured minus predicted path loss [n], [dB].
-        known: Columns that can explain the residuals in another way, such as whether a link is out of sight [n].
+        known: Columns that are other possible explanations of the residuals, such as whether a link is out of sight
+            [n].
 
     Returns:
         The rectangle; None if there are too few links, or if no rectangle with extra loss explains any of the
@@ -112,17 +114,17 @@ def missing_region(
         return None
     random = np.random.default_rng(0)
     orders = np.stack([residual, *(random.permutation(residual) for _ in range(SHUFFLES))])
-    # Shuffled residuals are no longer orthogonal to the fitted columns.
+    # Permuted residuals are no longer orthogonal to the fitted columns.
     orders -= (orders @ basis) @ basis.T
     corner, cell = _grid(tx, rx)
     lowest = float(min(tx[:, 2].min(), rx[:, 2].min()))
     best, chance = None, np.zeros(SHUFFLES)
     for height in HEIGHTS:
         length = _lengths(tx, rx, corner, cell, lowest + height)
-        # The part of the lengths that the fitted columns do not explain already.
+        # Keep the part of the lengths that the fitted columns do not explain.
         inside = length - basis @ (basis.T @ length)
         rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
-        # Residuals in random order are tested with the same heights and rectangles.
+        # Permuted residuals are tested with the same heights and rectangles.
         chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
         top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
@@ -162,7 +164,7 @@ def _lengths(
     point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
     index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)
     number = np.arange(len(tx))[:, None] * GRID**2 + index[..., 0] * GRID + index[..., 1]
-    # Each point represents a piece of its line; pieces above the top do not count.
+    # Each point represents a piece of its line; pieces above `top` do not count.
     piece = np.linalg.norm(rx - tx, axis=1)[:, None] / SAMPLES * (point[..., 2] < top)
     counts = np.bincount(number.reshape(-1), piece.reshape(-1), len(tx) * GRID**2)
     return counts.reshape(len(tx), GRID**2).astype(np.float64)
@@ -171,8 +173,8 @@ def _lengths(
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
     """The best rectangle of the grid for each width.
 
-    `moments` are the scalar products of the cells' columns with the residuals, unshuffled residuals first [cells, k].
-    `products` are those of the cells' columns with each other [cells, cells].
+    `moments` contains the scalar products of the cells' columns with the residuals, unpermuted residuals first [cells,
+    k]. `products` contains the scalar products of the cells' columns with each other [cells, cells].
     """
     moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
     total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))
@@ -190,7 +192,8 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
         # Below this limit, rounding errors dominate.
         used = square > 1e-6 * largest
         root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
-        # Signed root of the sum of squares that a rectangle explains: only extra loss counts.
+        # Signed root of the sum of squares that a rectangle explains; the sign shows whether the loss is extra loss,
+        # which alone counts.
         loss = band[:, north]
         loss -= band[:, south]
         loss *= root[..., None]

@@ -1,9 +1,9 @@
-"""Noise models, and the marginal density of the measurements under each.
+"""Noise models, and the marginal density of the measurements under each model.
 
-Errors may be independent and Gaussian, correlated between neighbours, larger out of sight, or heavy-tailed. There may
-be an undeclared offset. Larger errors out of sight are a discrepancy of the digital twin (M. C. Kennedy and A. O'Hagan,
-J. Royal Statistical Society B 63, 2001): paths that the twin lacks change the path loss of its weak links
-(`excess_db`). The right model is unknown, and choosing the best-fitting model would ignore others that fit nearly as
+Errors may be independent and Gaussian, correlated between neighbouring links, larger out of sight, or heavy-tailed.
+There may be an undeclared offset. Larger errors out of sight are a discrepancy of the digital twin (M. C. Kennedy and
+A. O'Hagan, J. Royal Statistical Society B 63, 2001): paths that the twin lacks change the path loss of its weak links
+(`excess_db`). The right model is unknown, and choosing the best-fitting model would ignore models that fit nearly as
 well. Every model therefore has a prior weight, and results are averages over all models (Bayesian model averaging). A
 discrepancy that the data do not support receives almost no weight, and does not absorb effects that the parameters
 explain.
@@ -17,8 +17,8 @@ Harville, Biometrika 61, 1974): with whitened errors y and design Z, ridge R, A 
 where f is the number of links minus the number of columns with a flat prior. For heavy tails, both integrals use
 Laplace's approximation (`laplace.py`).
 
-Paths that the twin lacks, such as paths through buildings, add power. They hardly change the power of line-of-sight
-links. Out of sight, the twin underestimates the power by their contribution.
+Paths that the twin lacks, such as paths through buildings, add power. These paths hardly change the power of
+line-of-sight links. For links out of sight, the twin underestimates the power by the contribution of these paths.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ from calibray.uncertainty.residual_correlation import (
 )
 
 CANDIDATES: Final = 16
-"""Number of candidates within the bounds; the scene's prediction for a link is the median of their path losses."""
+"""Number of candidates within the bounds; the scene's prediction for a link is the median path loss over these
+candidates."""
 
 STRONGEST: Final = 0.05
-"""Quantile of the excess loss that represents the strongest links: those in line of sight, if there are any."""
+"""Quantile of the excess loss that represents the strongest links, which are line-of-sight links if there are any."""
 
 
 def excess_db(problem: Problem) -> NDArray[np.float64]:
-    """Excess loss of links out of sight over free space, relative to that of the strongest links [L], [dB].
+    """Excess over free-space loss of links out of sight, relative to the excess of the strongest links [L], [dB].
 
-    It is the median over candidates within the bounds; minus infinity for links in sight, which have a direct path, and
-    for links without a path.
+    The result is the median over candidates within the bounds. It is minus infinity for links in sight, which have a
+    direct path, and for links without a path.
     """
     from scipy.stats import qmc  # takes 0.4 s
 
@@ -80,43 +81,44 @@ NO_OFFSET: Final = 1e3
 """Inverse prior standard deviation that keeps an offset at 0 [1/dB]."""
 
 SHARES: Final = (0.4, 0.7, 0.95)
-"""Trial values of the correlated share of the variance."""
+"""Trial values of the correlated fraction of the variance."""
 
 RANGES: Final = 4
-"""Number of correlation ranges tried, from the distance between neighbours to a third of the campaign's extent."""
+"""Number of trial correlation ranges, from the distance between neighbours to a third of the campaign's extent."""
 
 SAME_PLACE: Final = 0.01
-"""Correlation range, relative to the distance between neighbours, of errors that only links at the same position
-share."""
+"""Correlation range, relative to the distance between neighbours, that represents errors shared only by links at the
+same position."""
 
 FREEDOMS: Final = (2.0, 4.0)
 """Trial values of the degrees of freedom of Student's t."""
 
 DEPARTURE: Final = 2.0
 """Prior weight of an offset, relative to no offset, and of correlated or heavy-tailed errors, relative to independent
-Gaussian errors. Measured errors are rarely independent and Gaussian. Larger errors out of sight have weight one. If the
-twin lacks refraction, their posterior weight exceeds 0.9 in five of nine development runs."""
+Gaussian errors. Measured errors are rarely independent and Gaussian. Larger errors out of sight have a prior weight of
+one. If the twin lacks refraction, the posterior weight of larger errors out of sight exceeds 0.9 in five of nine
+development runs."""
 
 IMPROBABLE: Final = 50.0
 """With many links, a model is left out if the log odds against it at the optimum reach this value. At its own optimum,
-the model can gain a few units per parameter, which is far less."""
+the model can gain only a few units per parameter, which is far less than this limit."""
 
 LEVELS: Final = (5.0, 15.0, 25.0)
 """Trial levels of the power that the twin lacks out of sight, in dB below the power in sight. In three development
 districts with twins that lack refraction, the missing power is 2 to 35 dB below the power in sight."""
 
 COMMON: Final = 0.5
-"""Share of the variance of errors out of sight that all links have in common, because missing paths can only add
+"""Fraction of the variance of errors out of sight that all links have in common, because missing paths can only add
 power."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"
 
 DIFFERING: Final = "heterogeneous"
-"""Name of the hypothesis that buildings differ, which has a posterior weight like the kinds of noise."""
+"""Name of the hypothesis that buildings differ; like the kinds of noise, it has a posterior weight."""
 
 OFFSET: Final = "offset"
-"""Name of the hypothesis of an undeclared offset, which has a posterior weight like the kinds of noise."""
+"""Name of the hypothesis of an undeclared offset; like the kinds of noise, it has a posterior weight."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,9 @@ class NoiseModel:
     Attributes:
         kind: "gaussian", "correlated", "out_of_sight" (larger out of sight) or "student-t".
         weight: Its prior weight.
-        offset: Whether it includes an undeclared offset.
+        offset: Whether the model includes an undeclared offset.
         range: Correlation range, if "correlated" [m]; level of the power that the twin lacks, if "out_of_sight" [dB].
-        share: Correlated share of the variance, if "correlated".
+        share: Correlated fraction of the variance, if "correlated".
         freedom: Degrees of freedom, if "student-t".
         gross: Whether the errors are Gaussian with a few gross errors instead of Student's t, if "student-t".
     """
@@ -156,16 +158,16 @@ def noise_models(
     Args:
         position: Positions of the links' ends [m, 3 or 6], [m].
         kind: "gaussian" or "student-t" if declared; both are tried if None.
-        range_m: Correlation range, 0 for none [m]; several are tried if None.
+        range_m: Correlation range [m]; 0 for no correlation; several ranges are tried if None.
         offset: Whether to try an undeclared offset.
-        censored: Whether any links are censored; gross errors are then left out, because their probability of
+        censored: Whether any links are censored; if so, gross errors are left out, because their probability of
             censoring is not implemented.
         out_of_sight: Whether to try larger errors of links out of sight.
 
     Returns:
         The models; their weights sum to one.
     """
-    # A declared range rules out independent errors, and a range of 0 rules out correlated ones.
+    # A declared range excludes independent errors, and a range of 0 excludes correlated errors.
     kinds = [[NoiseModel(GAUSSIAN, 1.0)]] if kind != HEAVY and not range_m else []
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
     if kind != HEAVY and ranges:
@@ -193,9 +195,9 @@ def noise_models(
 
 
 def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
-    """Correlation ranges to try; none for fewer than three positions.
+    """Correlation ranges to try; empty for fewer than three positions.
 
-    If several links share a position, errors that only these links share are also tried.
+    If several links share a position, a model with errors that only these links share is also tried.
     """
     places = np.unique(position, axis=0)
     distance = pairwise(places)
@@ -211,16 +213,17 @@ def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """Marginal density of the measurements given path loss, under several noise models.
+    """Marginal density of the measurements for given path loss, under several noise models.
 
     Attributes:
         design: Columns of the nuisance, times the square roots of the weights [m, q].
-        ridge: Noise level over the standard deviations of the coefficients' priors [q]; 0 for a flat prior.
-        column: The column of an undeclared offset, scaled in the same way [m].
+        ridge: Ratio of the noise level to each coefficient's prior standard deviation [q]; 0 for a flat prior.
+        column: The column of an undeclared offset, multiplied by the same square roots [m].
         noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
-        whiteners: Whitener of each correlated or "out_of_sight" model, by kind, range and share.
-        censored: Mask of the censored links, whose gaps are lower limits [m]; if any, no model has a whitener.
+        whiteners: Whitener of each "correlated" or "out_of_sight" model, by kind, range and share.
+        censored: Mask of the censored links, whose gaps are lower limits [m]; if any link is censored, no model has a
+            whitener.
     """
 
     design: NDArray[np.float64]
@@ -247,7 +250,7 @@ class Marginal:
 
         Args:
             design: Columns of the nuisance, not scaled [m, q].
-            ridge: Noise level over the standard deviations of the coefficients' priors [q]; 0 for a flat prior.
+            ridge: Ratio of the noise level to each coefficient's prior standard deviation [q]; 0 for a flat prior.
             scale: Square roots of the links' weights, with mean square one [m].
             position: Positions of the links' ends [m, 3 or 6], [m].
             noise_db: Approximate noise level [dB].
@@ -270,7 +273,7 @@ class Marginal:
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
     def without_improbable(self, gap: NDArray[np.float64]) -> Marginal:
-        """The density without models that explain the gaps at the optimum [1, m] much worse than the best model."""
+        """The density without models that fit the gaps at the optimum [1, m] much worse than the best model."""
         density = self.densities(gap)[0]
         kept = np.flatnonzero(density > density.max() - IMPROBABLE)
         return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
@@ -316,7 +319,7 @@ class Marginal:
             white, shift = filter_.apply(white), 0.5 * filter_.log_determinant
         square, freedom = white.T @ white, len(design) - int((ridge == 0).sum())
         if len(ridge):
-            # The form is S in the module's docstring; the shift contains |C| and |A|.
+            # The quadratic form is S in the module's docstring; the shift contains |C| and |A|.
             columns = white @ design
             matrix, side = regular(columns.T @ columns + np.diag(ridge**2)), columns.T @ white
             square -= side.T @ np.linalg.solve(matrix, side)
@@ -324,7 +327,7 @@ class Marginal:
         return square, _constant(freedom, ridge) - shift, 0.5 * freedom
 
     def heavy(self, gap: NDArray[np.float64], models: Sequence[NoiseModel]) -> NDArray[np.float64]:
-        """Log density of finite gaps [n, m] under their "student-t" models [n], without these models' weights [n].
+        """Log density [n] of finite gaps [n, m], each under its own "student-t" model, without the models' weights.
 
         Either all or none of the models have gross errors.
         """
@@ -332,7 +335,8 @@ class Marginal:
         design, ridge = self._with_offset(bool(offset.any()))
         by_gap = np.tile(ridge / self.noise_db, (len(gap), 1))
         if offset.any():
-            # A ridge this large fixes the offset at 0. Its prior's normalisation cancels the integral over it.
+            # A ridge this large fixes the offset at 0. The normalisation of the offset's prior cancels the integral
+            # over the offset.
             by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])
         return evidence(gap, design, by_gap, gross() if models[0].gross else student(freedom))
@@ -357,7 +361,7 @@ def _plain(
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:
-        # With A = F F', y'Z A^-1 Z'y is the square of F^-1 Z'y, and |A|^(1/2) the product of F's diagonal.
+        # With A = F F', y'Z A^-1 Z'y is the square of F^-1 Z'y, and |A|^(1/2) is the product of the diagonal of F.
         factor = np.linalg.cholesky(regular(design.T @ design + np.diag(ridge**2)))
         square = square - np.sum(np.linalg.solve(factor, design.T @ gap.T) ** 2, axis=0)
         log_root = float(np.log(np.diag(factor)).sum())

@@ -1,13 +1,14 @@
 """Moves of a population's members that leave the prior times a power of the likelihood invariant.
 
-- One or more parameters move along the difference of two other members (C. J. F. ter Braak, Statistics and Computing
-  16, 2006).
+- One or more parameters move along the difference between two other members (C. J. F. ter Braak, Statistics and
+  Computing 16, 2006).
 - One parameter is redrawn from the smoothed density of its values in the population. Because of reflections inside
-  walls, several narrow ranges of permittivity can fit; a member can reach any of them in one move.
+  walls, several narrow ranges of permittivity can fit; a member can reach any of these ranges in one move.
 - The constants of one, two or all buildings are redrawn around their current values (S. L. Cotter, G. O. Roberts, A. M.
   Stuart and D. White, Statistical Science 28, 2013).
-- The between-building spread is redrawn from its prior, together with all buildings, which become equal or different.
-- Means and spread are redrawn given the buildings' constants. The constants, and with them path loss, stay the same, so
+- The between-building spread and the constants of all buildings are redrawn from their prior. The buildings then become
+  equal or different.
+- Means and spread are redrawn given the buildings' constants. The constants and therefore path loss stay the same, so
   no replay is needed (interweaving: Y. Yu and X.-L. Meng, J. Computational and Graphical Statistics 20, 2011).
 - The noise model is redrawn given the errors.
 """
@@ -26,7 +27,7 @@ SPREAD_GRID: Final = 64
 """Number of points of the logarithmic grid from which the spread is drawn."""
 
 ACCEPTANCE: Final = 0.25
-"""Target share of accepted moves, which determines the lengths of moves. It is near 0.234, the optimum for random walks
+"""Target acceptance rate, which determines the lengths of moves. The target is near 0.234, the optimum for random walks
 (G. O. Roberts, A. Gelman and W. R. Gilks, Annals of Applied Probability 7, 1997)."""
 
 JITTER: Final = 1e-4
@@ -34,10 +35,10 @@ JITTER: Final = 1e-4
 reached."""
 
 NEIGHBOURHOOD: Final = 32
-"""Each side of a kernel, one width long, spans the share 1 / `NEIGHBOURHOOD` of the population on average."""
+"""On average, one kernel width on either side spans a fraction 1 / `NEIGHBOURHOOD` of the population."""
 
 TINY: Final = 1e-30
-"""Value that replaces a constant of 0 in logarithms; factors on such a constant have no effect."""
+"""Value that replaces a constant of 0 in logarithms; multiplying a constant of 0 by a factor has no effect."""
 
 NEVER: Final = -1e300
 """Finite replacement for a log density of minus infinity."""
@@ -52,8 +53,8 @@ class Population:
         deviation: Standardised deviations z of the buildings' constants [n, c].
         spread: Between-building spread [n].
         model: Index of the noise model [n].
-        gap: Measured minus modelled path loss, weighted [n, m], [dB].
-        log_likelihood: Log density of the links under that model [n].
+        gap: Weighted difference between measured and modelled path loss [n, m], [dB].
+        log_likelihood: Log density of the links under the noise model [n].
         log_prior: Log prior density of the point [n].
     """
 
@@ -70,7 +71,7 @@ class Population:
         return Population(*(part[index] for part in self.parts()))
 
     def updated(self, accepted: NDArray[np.bool_], proposal: Population) -> Population:
-        """The members of the proposal where it is accepted [n], otherwise the current members."""
+        """The population in which proposed members replace current members where the proposal is accepted [n]."""
         return Population(
             *(
                 np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
@@ -79,7 +80,7 @@ class Population:
         )
 
     def without_gaps(self) -> Population:
-        """The members without their gaps, which occupy most of the memory."""
+        """The members without the gaps, which occupy most of the memory."""
         return replace(self, gap=self.gap[:, :0])
 
     def parts(self) -> tuple[NDArray, ...]:
@@ -101,7 +102,7 @@ class Lengths:
 
 
 def evaluated(model: JointModel, population: Population) -> Population:
-    """The population with gaps and densities recomputed."""
+    """The population with recomputed gaps and densities."""
     gap = model.gaps(population.point, population.spread[:, None] * population.deviation)
     log_likelihood = model.densities(gap, population.model)
     log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, NEVER)
@@ -140,7 +141,7 @@ class Moves:
         return population
 
     def _move_points(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
-        """Move along the difference of two other members; a third of the moves use the full difference."""
+        """Move along the difference between two other members; a third of the moves use the full difference."""
         random = self.random
         count, width = population.point.shape
         shift = random.choice(np.arange(1, count), 2, replace=False)
@@ -159,7 +160,7 @@ class Moves:
         return moved, replace(lengths, points=points)
 
     def _redraw_coordinate(self, population: Population) -> Population:
-        """Redraw one parameter from its values in the population, smoothed by Gaussian kernels of adapted width."""
+        """Redraw one parameter from its density in the population, smoothed by Gaussian kernels of adapted width."""
         random, (count, width) = self.random, population.point.shape
         chosen, point, log_ratio = random.integers(0, width, count), population.point.copy(), np.zeros(count)
         near = max(2, count // NEIGHBOURHOOD)
@@ -170,7 +171,7 @@ class Moves:
             size = (centre[np.minimum(high, count - 1)] - centre[np.maximum(low, 0)]) / 2 + JITTER
             kernel = random.integers(0, count, len(rows))
             value = centre[kernel] + size[kernel] * random.standard_normal(len(rows))
-            # The acceptance rule needs the proposal density at the current value and at the new one.
+            # The acceptance rule needs the proposal density at the current value and at the new value.
             both = np.concatenate([population.point[rows, index], value])
             density = np.mean(np.exp(-0.5 * ((both[:, None] - centre) / size) ** 2) / size, axis=1)
             with np.errstate(divide="ignore"):
@@ -181,14 +182,17 @@ class Moves:
     def _at_points(
         self, population: Population, point: NDArray[np.float64], log_ratio: float | NDArray[np.float64] = 0.0
     ) -> tuple[Population, NDArray[np.bool_]]:
-        """The population with accepted points [n, d + k], and their mask [n]; a point out of bounds needs no replay."""
+        """The population with accepted points [n, d + k], and their mask [n]; points out of bounds need no replay."""
         inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal, log_ratio)
         return population.updated(accepted, proposal), accepted
 
     def _move_buildings(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
-        """Redraw one, two or all buildings; sqrt(1 - b^2) z + b xi is standard normal if z and xi are."""
+        """Redraw the constants of one, two or all buildings.
+
+        If z and xi are standard normal, sqrt(1 - b^2) z + b xi is standard normal as well.
+        """
         building_of, random = self.model.building_of, self.random
         count, width = population.deviation.shape
         number = int(building_of.max()) + 1
@@ -201,21 +205,21 @@ class Moves:
         normal = random.standard_normal((count, width))
         deviation = np.sqrt(1.0 - length**2) * population.deviation + length * normal
         moved = replace(population, deviation=deviation)
-        # If the spread is 0, deviations have no effect: no replay is needed, and every move is accepted.
+        # If the spread is 0, deviations have no effect, so no replay is needed and every move is accepted.
         proposal = self._evaluated_where(population.spread > 0, population, moved)
         accepted = self._accepts(population, proposal)
         buildings = _adapted(lengths.buildings, accepted[all_buildings & (population.spread > 0)], 1.0)
         return population.updated(accepted, proposal), replace(lengths, buildings=buildings)
 
     def _redraw_all_buildings(self, population: Population) -> Population:
-        """Propose spread and deviations from their prior; buildings then become equal, or differ more or less."""
+        """Propose spread and deviations from their prior, so that buildings become equal or differ more or less."""
         count = len(population.spread)
         proposal = replace(
             population,
             spread=self.model.draw_spread(count, self.random),
             deviation=self.random.standard_normal(population.deviation.shape),
         )
-        # The proposal is the prior, so the likelihood alone decides.
+        # The proposal density is the prior, so acceptance depends only on the likelihood.
         either = (population.spread > 0) | (proposal.spread > 0)
         proposal = self._evaluated_where(either, population, proposal)
         return population.updated(self._accepts(population, proposal), proposal)
@@ -229,12 +233,15 @@ class Moves:
         return population
 
     def _redraw_mean(self, population: Population, index: int) -> Population:
-        """Redraw mean x: log x is normal about the mean of k buildings with deviation s / sqrt(k), times the prior."""
+        """Redraw the mean x of a parameter over the buildings.
+
+        The density of log x is the prior times a normal density about the mean of k buildings with deviation s / sqrt(k).
+        """
         parameters, columns = self.model.parameters, self.model.parameter_of == index
         values, spread = parameters.from_unit(population.point), population.spread
         differing = spread > 0
         before = np.log(np.maximum(values[:, index], TINY))
-        # Logarithms of the buildings' constants, which do not change.
+        # The logarithms of the buildings' constants do not change.
         constants = before[:, None] + spread[:, None] * population.deviation[:, columns]
         normal = self.random.standard_normal(len(spread))
         after = constants.mean(axis=1) + spread / np.sqrt(columns.sum()) * normal
@@ -245,7 +252,7 @@ class Moves:
         point = population.point.copy()
         point[:, index] = parameters.to_unit(moved)[:, index]
         log_prior = self.model.log_prior(point)
-        # A prior flat in the search coordinate u has the density x / (dx / du) in log x.
+        # A prior that is flat in the search coordinate u has the density x / (dx / du) in log x.
         slope_after = parameters.search_slope(moved)[:, index]
         slope_before = parameters.search_slope(values)[:, index]
         change = after - before - np.log(slope_after / slope_before) + log_prior - population.log_prior
@@ -267,7 +274,7 @@ class Moves:
     def _evaluated_where(
         self, changed: NDArray[np.bool_], population: Population, proposal: Population
     ) -> Population:
-        """The proposal, evaluated for the members in `changed` [n]; the others keep their densities."""
+        """The proposal, evaluated for the members in the mask `changed` [n]; the other members keep their densities."""
         rows = np.flatnonzero(changed)
         if not len(rows):
             return proposal
@@ -281,7 +288,7 @@ class Moves:
     def _accepts(
         self, population: Population, proposal: Population, log_ratio: float | NDArray[np.float64] = 0.0
     ) -> NDArray[np.bool_]:
-        """Metropolis-Hastings rule [n]; minus an exponential variate is the logarithm of a uniform variate."""
+        """Metropolis-Hastings rule [n]; a negated exponential variate is the logarithm of a uniform variate."""
         change = self.power * (proposal.log_likelihood - population.log_likelihood)
         change += proposal.log_prior - population.log_prior + log_ratio
         return np.asarray(-self.random.standard_exponential(len(change)) < change)
@@ -292,7 +299,7 @@ def _redraw_spread(population: Population, random: np.random.Generator) -> Popul
     grid = np.geomspace(*SPREAD_BOUNDS, SPREAD_GRID)
     square = np.sum((population.spread[:, None] * population.deviation) ** 2, axis=1)
     width = population.deviation.shape[1]
-    # The width of a grid cell adds a factor s.
+    # The width of a logarithmic grid cell adds a factor s.
     log_density = -grid / MEAN_SPREAD - (width - 1) * np.log(grid) - 0.5 * square[:, None] / grid**2
     spread = grid[np.argmax(log_density + random.gumbel(size=log_density.shape), axis=1)]
     spread = np.where(population.spread > 0, spread, 0.0)
@@ -302,7 +309,7 @@ def _redraw_spread(population: Population, random: np.random.Generator) -> Popul
 
 
 def _adapted(length: float, accepted: NDArray[np.bool_], longest: float) -> float:
-    """The length of moves, adapted to their acceptance rate."""
+    """The length of moves, adapted to the acceptance rate."""
     if not len(accepted):
         return length
     return float(np.clip(length * np.exp(0.5 * (accepted.mean() - ACCEPTANCE)), 0.02, longest))

@@ -1,12 +1,12 @@
 """Checks of a finished calibration that lead to remarks: noise, missed optimum, intervals, undeclared offset, conflict.
 
-Path loss and further observables may contradict each other by more than their errors explain. They then require
-different parameters. The parameters are fitted to path loss alone, to the further observables alone, and to both. The
-test statistic is the increase in both sums of squares from the separate fits to the common fit, divided by the
-variances of the errors and by the number of parameters. It follows an F distribution if one set of parameters explains
-all data. It is also possible that no parameter values explain an observable, as if it were measured in a different
-scene. Measured values are therefore regressed on modelled values. The slope is 1 if the model is right, and near 0 if
-the two are unrelated.
+Path loss and further observables may contradict each other by more than their errors explain. In this case, path loss
+and the observables require different parameter values. The parameters are fitted to path loss alone, to the further
+observables alone, and to both. The test statistic is the increase in both sums of squares from the separate fits to the
+common fit, divided by the variances of the errors and by the number of parameters. This statistic follows an F
+distribution if one set of parameters explains all data. It is also possible that no parameter values explain an
+observable, as if the observable were measured in a different scene. Measured values are therefore regressed on modelled
+values. The slope is 1 if the model is right, and near 0 if measured and modelled values are unrelated.
 """
 
 from __future__ import annotations
@@ -33,31 +33,33 @@ from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OFFSET, OUT_OF_SIGHT
 
 SIGNIFICANT: Final = 0.005
-"""A conflict is reported if the probability of a larger increase without a conflict is below this value. Errors that
-neighbouring links share make small probabilities slightly more frequent."""
+"""A conflict is reported if a larger increase would occur without a conflict only with a probability below this value.
+Errors shared by neighbouring links make small probabilities slightly more frequent."""
 
 UNRELATED: Final = 0.02
 """An observable is reported as not fitting the scene if the probability of a slope this small under the model is below
 this value, divided by the number of observables."""
 
 FEWEST: Final = 5
-"""Degrees of freedom below which no slope is tested."""
+"""Minimum number of degrees of freedom for testing a slope."""
 
 CONFLICT_STARTS: Final = 32
 """Number of local searches per fit."""
 
 DOMINANT: Final = 1e3
 """Factor by which the residuals of the further observables are multiplied in the fit to these observables alone. In the
-fit to path loss alone, these residuals are divided by this factor. All fits can then use the same compiled program."""
+fit to path loss alone, these residuals are divided by this factor. With this factor, all fits can use the same compiled
+program."""
 
 
 def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...]:
-    """Compare the parameters that path loss requires with those that further observables require.
+    """Compare the parameter values that path loss requires with the values that further observables require.
 
     The minima of the problem [k, d] are starting points of the fits.
 
     Returns:
-        Remarks that state both fits and the size of the conflict in standard errors; empty if there is no conflict.
+        Remarks that state both fits and the size of the conflict in standard errors; no remarks if there is no
+        conflict.
     """
     objective, width = problem.objective, len(problem.parameters)
     starts = minima[:BASINS]
@@ -74,7 +76,8 @@ def conflict(problem: Problem, minima: NDArray[np.float64]) -> tuple[Remark, ...
     increase = (
         _squares(own, both) - np.array([_squares(own, links)[0], _squares(own, further)[1]])
     ) / noise_db**2
-    # The common fit has one set of parameters, and the separate fits have two: `width` degrees of freedom.
+    # The common fit has one set of parameters, and the separate fits have two sets; this gives `width` degrees of
+    # freedom.
     statistic = float(increase.sum()) / width
     probability = float(fdtrc(width, freedom + of_further, max(statistic, 0.0)))
     first, second = (problem.parameters.from_search(point) for point in (links, further))
@@ -115,7 +118,7 @@ class Slope(NamedTuple):
 
 
 def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
-    """Slopes of the observables at a point of the search space, fitted with a constant or with the devices' biases."""
+    """Slopes of the observables at a point of the search space, fitted with a constant or the devices' biases."""
     modelled = problem.respond(problem.parameters.from_search(point[None])).observed[0]
     slopes = []
     for each, values in zip(problem.observed, modelled, strict=True):
@@ -125,7 +128,7 @@ def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
         groups = np.unique(each.group[used], return_inverse=True)[1]
         x, y = (column - (np.bincount(groups, column) / np.bincount(groups))[groups] for column in (x, y))
         left = len(used) - (groups.max(initial=0) + 1) - 1
-        # Values that hardly differ from link to link do not determine a slope.
+        # Values that hardly vary from link to link do not determine a slope.
         if left < FEWEST or np.sum(x**2) <= 1e-12 * np.sum((values[used] / each.scale) ** 2):
             continue
         slope = float(np.sum(x * y) / np.sum(x**2))
@@ -152,21 +155,21 @@ LIKELY: Final = 0.75
 three to one. A priori, buildings differ with a probability of one half."""
 
 NOTABLE: Final = 0.25
-"""Smallest posterior weight of a kind of noise that is reported; several kinds can share the weight."""
+"""Minimum posterior weight of a kind of noise that is reported; several kinds of noise can share the weight."""
 
 SLACK: Final = 0.02
-"""A calibrated value is reported if its distance from its interval exceeds this share of the search range, which is
-logarithmic for a parameter with a logarithmic scale."""
+"""A calibrated value is reported if its distance from its interval exceeds this fraction of the search range. The
+search range is logarithmic for a parameter with a logarithmic scale."""
 
 MISSED_DB: Final = 0.01
-"""The method is reported to have missed the optimum if a draw has an objective that is lower by at least this much
-[dB]."""
+"""The method is reported to have missed the optimum if the objective of a draw is lower by at least this much [dB]."""
 
 STARTS: Final = 16
-"""Number of local searches with a free offset, in addition to those that start from the minima without an offset."""
+"""Number of local searches with a free offset, in addition to the searches that start from the minima without an
+offset."""
 
 OFFSET_DB: Final = 0.1
-"""Smallest undeclared offset that is reported [dB]."""
+"""Minimum undeclared offset that is reported [dB]."""
 
 DEPARTURES: Final = {
     CORRELATED: RemarkKind.CORRELATED_NOISE,
@@ -179,7 +182,8 @@ DEPARTURES: Final = {
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
     """A remark for each noise model that the data favour over independent Gaussian noise, from the posterior weights.
 
-    Noise that the study states is not reported. A remark on errors out of sight lists tracer settings that add paths.
+    Noise that the study states is not reported. A remark about errors out of sight lists tracer settings that add
+    paths.
     """
     gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
     stated = {
@@ -191,7 +195,8 @@ def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, .
         if stated.get(kind, False):
             continue
         weight = float(noise.get(kind, 0.0))
-        # Buildings are equal or differ; noise models compete with Gaussian noise.
+        # The alternative to differing buildings is equal buildings; the alternative to other kinds of noise is Gaussian
+        # noise.
         rival = 1.0 - weight if kind == DIFFERING else gaussian
         if weight > max(NOTABLE, LIKELY * (weight + rival)):
             values: dict[str, Value] = {"weight": weight, "gaussian_weight": gaussian}
@@ -202,7 +207,7 @@ def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, .
 
 
 def _lacking(study: StudyModel) -> list[str]:
-    """Settings of the tracer that would find more paths, written as in a study file; empty for an external program."""
+    """Tracer settings that would find more paths, written as in a study file; empty for an external program."""
     if study.engine.external:
         return []
     switches = [f"{name} = true" for name in ("refraction", "diffraction") if not getattr(study.trace, name)]
@@ -211,7 +216,7 @@ def _lacking(study: StudyModel) -> list[str]:
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
-    """A remark if a draw's objective [dB] is lower than that of the method's best candidate by at least `MISSED_DB`."""
+    """A remark if a draw's objective [dB] is lower than the method's best objective by at least `MISSED_DB`."""
     top = posterior.point[np.argsort(-posterior.density)[:16]]
     lowest = float(problem.squares(top).value.min())
     if lowest > best_value - MISSED_DB:
@@ -229,14 +234,14 @@ def outside_interval(
     log_odds: float,
     noise: Mapping[str, float],
 ) -> tuple[Remark, ...]:
-    """A remark that names the parameters with calibrated values outside their intervals, and the cause.
+    """A remark that names the parameters whose calibrated values are outside their intervals, and states the cause.
 
     Args:
         problem: The problem.
         optimum: The calibrated values by parameter.
         intervals: The intervals.
-        most_probable: The values by parameter of the draw with the highest density at the scene's constants.
-        log_odds: Log density of that draw minus that of the calibrated values.
+        most_probable: The values, by parameter, of the draw with the highest density at the scene's constants.
+        log_odds: Log density of this draw minus the log density of the calibrated values.
         noise: Posterior weights of the noise models.
     """
     parameters, outside = problem.parameters, []
@@ -268,9 +273,9 @@ class UndeclaredOffset(NamedTuple):
     """An offset for all links, fitted in addition to the study's model.
 
     Attributes:
-        offset_db: The best offset [dB]; None if the study declares one, or if an offset does not improve the fit.
+        offset_db: The best offset [dB]; None if the study declares an offset, or if an offset does not improve the fit.
         error_db: Its standard error [dB].
-        remarks: A warning if it is significant.
+        remarks: A warning if the offset is significant.
     """
 
     offset_db: float | None = None
