@@ -134,7 +134,10 @@ def test_a_failing_trace_keeps_the_calibration(
     monkeypatch.setattr(cb.Setup, "trace", failing)
     result = cb.calibrate(plan)
     assert RemarkKind.RICHER_PATHS not in {each.kind for each in result.uncertainty.remarks}
-    assert "paths with refraction and diffraction could not be tried: too many paths" in caplog.text
+    assert (
+        "the trace with refraction and diffraction failed, so richer paths are not considered: too many paths"
+        in caplog.text
+    )
 
 
 def test_the_remark_names_settings_errors_and_values_outside_of_their_intervals() -> None:

@@ -77,7 +77,7 @@ MAX_COLUMNS: Final = 100
 
 SHOWN_DIFFERENCE: Final = 0.1
 """The credible set for the measured buildings is reported if it differs sufficiently from the set for all buildings.
-They must differ over more than this fraction of the range that both sets span together."""
+The sets must differ over more than this fraction of the range that they span together."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
 """Usual widths of parameter ranges: building materials have permittivities between 2 and 12, and conductivities that

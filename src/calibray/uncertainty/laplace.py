@@ -243,7 +243,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross() -> Tail:
-    """Gaussian errors; for a fraction `GROSS_SHARE` of them, the standard deviation is `GROSS_RATIO` times larger."""
+    """Gaussian errors; a fraction `GROSS_SHARE` of them have a standard deviation `GROSS_RATIO` times as large."""
     share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))

@@ -32,8 +32,8 @@ MOST: Final = 20_000
 """Maximum number of links in a search; if there are more links, only every kth link is used."""
 
 SHUFFLES: Final = 99
-"""Number of random permutations of the residuals. A rectangle is significant only if no rectangle explains as much of
-any permutation."""
+"""Number of random permutations of the residuals. A rectangle is significant only if the best rectangle of every
+permutation explains less."""
 
 
 class Explained(NamedTuple):
@@ -63,8 +63,8 @@ class MissingRegion:
         links: Number of links whose straight line crosses the region; an estimate if not all links are used.
         share: Fraction of the mean square of the residuals that the rectangle explains.
         chance: Median fraction of the mean square that the best rectangle explains if the residuals are permuted.
-        significant: Whether at least `FEW` links cross the region, and no rectangle explains as much of any
-            permutation.
+        significant: Whether at least `FEW` links cross the region, and the best rectangle of every permutation explains
+            less.
     """
 
     box: tuple[float, float, float, float]
@@ -192,8 +192,8 @@ def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> 
         # Below this limit, rounding errors dominate.
         used = square > 1e-6 * largest
         root = np.where(used, 1.0 / np.sqrt(np.where(used, square, 1.0)), 0.0)
-        # Signed root of the sum of squares that a rectangle explains; the sign shows whether the loss is extra loss,
-        # which alone counts.
+        # Signed root of the sum of squares that a rectangle explains; only extra loss, which has a positive sign,
+        # counts.
         loss = band[:, north]
         loss -= band[:, south]
         loss *= root[..., None]

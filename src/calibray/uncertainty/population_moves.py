@@ -235,7 +235,8 @@ class Moves:
     def _redraw_mean(self, population: Population, index: int) -> Population:
         """Redraw the mean x of a parameter over the buildings.
 
-        The density of log x is the prior times a normal density about the mean of k buildings with deviation s / sqrt(k).
+        The density of log x is the prior times a normal density about the mean of k buildings, with deviation s /
+        sqrt(k).
         """
         parameters, columns = self.model.parameters, self.model.parameter_of == index
         values, spread = parameters.from_unit(population.point), population.spread

@@ -33,7 +33,7 @@ from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, OFFSET, OUT_OF_SIGHT
 
 SIGNIFICANT: Final = 0.005
-"""A conflict is reported if a larger increase would occur without a conflict only with a probability below this value.
+"""A conflict is reported if its p-value, the probability of a larger increase without a conflict, is below this value.
 Errors shared by neighbouring links make small probabilities slightly more frequent."""
 
 UNRELATED: Final = 0.02

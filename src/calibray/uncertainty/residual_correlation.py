@@ -1,14 +1,15 @@
-"""Spatial correlation of errors: restricted-likelihood fit, test, variogram and whitening.
+"""Spatial correlation of errors: restricted-likelihood fit, significance test, variogram and whitening.
 
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
-because clutter that the scene lacks shadows all of them. Its covariance falls off exponentially with distance. Range
-and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), which prevents the
-fit of the parameters from biasing the noise estimate downwards. The fit is exact, with one Cholesky factorisation per
-trial, for up to a few thousand links.
+because clutter that the scene lacks shadows all these receivers. The covariance of this part falls off exponentially
+with distance. Range and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971),
+which prevents the fit of the parameters from biasing the noise estimate downwards. The fit is exact, with one Cholesky
+factorisation per trial, for up to a few thousand links.
 
-Whitening makes errors independent. For up to a few hundred links, the covariance of the errors is factored. For more
-links, each error is modelled as its conditional mean given the errors of the nearest earlier links, plus an independent
-remainder (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The time is then proportional to the number of links.
+Whitening makes errors independent. For up to a few hundred links, the covariance matrix of the errors is factored. For
+more links, each error is modelled as its conditional mean given the errors of the nearest earlier links, plus an
+independent remainder (A. V. Vecchia, J. R. Stat. Soc. B 50, 1988). The computing time is then proportional to the
+number of links.
 """
 
 from __future__ import annotations
@@ -28,29 +29,31 @@ from calibray.support.memory import single_blas_thread
 from calibray.uncertainty.draws import evenly_spaced
 
 SHARES: Final = (0.001, 0.999)
-"""Bounds of the correlated share of the variance; at 1, the covariance of links at one position would be singular."""
+"""Bounds of the correlated fraction of the variance; with 1, the covariance of links at the same position would be
+singular."""
 
 FEWEST_LINKS: Final = 10
 """Number of links below which no correlation is reported; fewer links cannot establish a correlation."""
 
 MOST_LINKS: Final = 500
-"""Largest number of links used for correlation and variogram; if there are more, an evenly spaced subset is used."""
+"""Maximum number of links used for correlation and variogram; if there are more links, an evenly spaced subset is
+used."""
 
 SIGNIFICANT: Final = 3.0
-"""Gain in log likelihood above which correlation is reported: about the 95 % quantile for two further parameters."""
+"""Gain in log likelihood above which correlation is reported, about the 95 % quantile for two additional parameters."""
 
 EXACT: Final = 600
-"""Number of links up to which the covariance is factored exactly."""
+"""Maximum number of links for which the covariance is factored exactly."""
 
 NEAREST: Final = 20
 """Number of neighbours in Vecchia's approximation."""
 
 CHUNK: Final = 500
-"""Number of links for which the equations of the neighbourhoods are solved together."""
+"""Number of links whose neighbourhood equations are solved together."""
 
 Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""An order of the links [m], and the indices in this order of each link's nearest earlier links [m, NEAREST]; -1 for
-none."""
+"""An order of the links [m], and the indices, in this order, of each link's nearest earlier links [m, NEAREST]; -1 if
+there are fewer earlier links."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ def fit_correlation(
 ) -> Correlation:
     """Fit range and size of the correlated part of errors [m], [dB], by restricted maximum likelihood.
 
-    Positions [m, k], [m], are those of the receivers or of both ends. The columns of `design` [m, q], which has full
-    rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
+    The positions [m, k], [m], are those of the receivers or of both ends. The columns of `design` [m, q], which has
+    full rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
 
     Raises:
         InputError: The number of links exceeds the number of columns by fewer than three, or all receivers share one
@@ -94,26 +97,26 @@ def fit_correlation(
     columns = np.zeros((count, 0)) if design is None else design
     if count - columns.shape[1] < 3:
         raise InputError(
-            f"noise: {count} links and {columns.shape[1]} fitted columns; the correlation of errors requires at least "
-            f"{columns.shape[1] + 3} links"
+            f"noise: the number of links ({count}) must exceed the number of fitted columns ({columns.shape[1]}) by at "
+            "least 3 to fit the correlation of errors"
         )
     distance, pairs = cdist(position, position), pdist(position)
     if not pairs.any():
         raise InputError("noise: all receivers have the same position; set range_m = 0")
     if not errors.any():
         raise EngineError("noise: all errors are zero, so no noise can be fitted; check the measured values")
-    # Below the first range, errors are independent; above the second, they are common to all links.
+    # Below the first range, errors are independent; above the second range, errors are common to all links.
     log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
 
     def trial(share: float, log_range: float) -> tuple[float, float]:
-        """Restricted log likelihood, and the total variance."""
+        """Restricted log likelihood and total variance."""
         matrix = share * np.exp(-distance / np.exp(log_range)) + (1 - share) * np.eye(count)
         return _restricted(matrix, errors, columns)
 
     def cost(point: NDArray[np.float64]) -> float:
         return -trial(*point)[0]
 
-    # The search is local, so it starts from the best of a few trials.
+    # The search is local, so it starts from the best of several trial points.
     start_ranges = np.quantile(log_ranges, (0.4, 0.6, 0.8))
     starts = [np.array([share, log_range]) for share in (0.3, 0.8) for log_range in start_ranges]
     # BLAS threads cost more time than they save on matrices of this size.
@@ -135,7 +138,7 @@ def fit_correlation(
 def _restricted(
     matrix: NDArray[np.float64], errors: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Restricted log likelihood of errors with the covariance `matrix` times a variance, and the best variance."""
+    """Restricted log likelihood of errors whose covariance is `matrix` times a variance, and the best variance."""
     factor = cho_factor(matrix, lower=True)
     freedom = len(errors) - columns.shape[1]
     solved = cho_solve(factor, np.column_stack([errors, columns]))
@@ -149,7 +152,7 @@ def _restricted(
 
 
 def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) -> Correlation | None:
-    """The correlation of the best fit's errors [m], [dB], at positions [m, k], [m]; None if it is not significant."""
+    """The correlation of the best fit's errors [m], [dB], at positions [m, k], [m]; None if not significant."""
     if len(errors) < FEWEST_LINKS:
         return None
     chosen = evenly_spaced(len(errors), MOST_LINKS)
@@ -164,12 +167,12 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
 def variogram(
     errors: NDArray[np.float64], position: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Empirical variogram: half the mean squared difference of errors versus distance between links.
+    """Empirical variogram: half the mean squared difference between errors versus the distance between links.
 
     A rising variogram indicates correlated errors, and a flat variogram indicates independent errors. Errors [m] are in
-    dB. Positions [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m], the
-    semivariance [8], [dB^2], and the number of pairs [8], for distance classes with about the same number of pairs.
-    There are fewer than 8 classes if there are fewer than 8 pairs.
+    dB. The positions [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m],
+    the semivariance [8], [dB^2], and the number of pairs [8], for distance classes with about the same number of pairs.
+    With fewer than 8 pairs, there are fewer than 8 classes.
     """
     chosen = evenly_spaced(len(errors), MOST_LINKS)
     distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
@@ -203,7 +206,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances [m, m] between positions [n, k] of links, or of a subset if there are at least twice `EXACT` links."""
+    """Distances [m, m] between link positions [n, k]; a subset of at least `EXACT` links is used if there are many."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 
@@ -218,10 +221,10 @@ def whitener(
 ) -> Whitener:
     """Make the whitener of the errors of links with end positions [m, k], [m].
 
-    The errors have been multiplied by `scale` [m], so that their uncorrelated part has the same variance for all links.
-    The correlated part has `share` of the variance, from 0 to below 1, and its covariance falls to 1/e at the distance
-    `range_m` [m]. For up to `exact` links, the covariance is factored exactly. If `neighbours` is None, they are
-    computed.
+    The errors have been multiplied by `scale` [m], so that the uncorrelated part has the same variance for all links.
+    The correlated part has the fraction `share` of the variance, from 0 to below 1. Its covariance falls to 1/e at the
+    distance `range_m` [m]. For up to `exact` links, the covariance is factored exactly. If `neighbours` is None, the
+    neighbours are computed.
     """
     count = len(position)
     if count <= exact:
@@ -233,8 +236,8 @@ def whitener(
 def shared(error: NDArray[np.float64], share: float) -> Whitener:
     """The whitener of errors of unit variance plus further errors with the standard deviations `error` [m].
 
-    All links have `share` of the further variance in common. For more than `EXACT` links, errors are treated as
-    independent.
+    The links have the fraction `share` of the further variance in common. For more than `EXACT` links, errors are
+    treated as independent.
     """
     if len(error) > EXACT:
         variance = 1.0 + error**2
@@ -275,13 +278,13 @@ def _vecchia(
         chosen = order[members[rows]]
         place, factor = position[chosen], np.where(members[rows] < 0, 0.0, scale[chosen])
         distance = np.sqrt(np.sum((place[:, :, None] - place[:, None]) ** 2, axis=-1))
-        # A missing neighbour has no covariance with others.
+        # A missing neighbour has no covariance with other links.
         common = np.exp(-distance / range_m) * factor[:, :, None] * factor[:, None]
         matrix = share * common + (1 - share) * diagonal
         # Conditional mean and variance of the last member given its neighbours.
         weight = np.linalg.solve(matrix[:, :-1, :-1], matrix[:, :-1, -1:])[..., 0]
         variance = matrix[:, -1, -1] - np.sum(matrix[:, -1, :-1] * weight, axis=1)
-        # A row: the member minus its conditional mean, divided by its conditional standard deviation.
+        # Each row gives the member minus its conditional mean, divided by its conditional standard deviation.
         entries[rows] = np.column_stack([-weight, np.ones(len(rows))]) / np.sqrt(variance)[:, None]
         log_determinant += float(np.log(variance).sum())
     row, column = np.nonzero(members >= 0)

@@ -1,8 +1,8 @@
-"""Uncertainty if the measurements favour paths that the study's trace leaves out.
+"""Uncertainty for measurements that favour paths left out by the study's trace.
 
-If a twin lacks paths, such as paths through buildings, its intervals lie around wrong values, because the constants
-compensate for the missing power. The links are therefore traced once more with refraction and diffraction. The evidence
-for each of the two twins, estimated from its draws, decides between them.
+If a digital twin lacks paths, such as paths through buildings, its intervals are centred on wrong values, because the
+constants compensate for the missing power. The links are therefore traced once more with refraction and diffraction.
+The choice between the two twins is based on the evidence for each twin, which is estimated from its draws.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LONGEST_TRACE: Final = 60.0
 """Estimated duration of a trace above which no richer paths are traced [s]."""
 
 LIKELY_LOG_ODDS: Final = float(np.log(LIKELY / (1.0 - LIKELY)))
-"""The uncertainty with richer paths is used if the logarithm of the odds in their favour is at least this."""
+"""The uncertainty with richer paths is used if the log odds in favour of these paths are at least this large."""
 
 OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
 """Remarks that compare draws with the calibrated values."""
@@ -46,15 +46,15 @@ def assess_richer_paths(
 ) -> Certainty:
     """The uncertainty with richer paths, and a remark, if the measurements favour these paths; otherwise `assessed`.
 
-    Nothing is traced if `lacking` returns no settings, for example if the study states the noise, if its
-    `fidelity.rounds` is 0, or if no link is out of sight. The stages of `progress` are "tracing more paths", "fitting
-    more paths" and "drawing with more paths".
+    Nothing is traced if `lacking` returns no settings. This is the case, for example, if the study states the noise, if
+    its `fidelity.rounds` is 0, or if no link is out of sight. The stages of `progress` are "tracing more paths",
+    "fitting more paths" and "drawing with more paths".
 
     Args:
         problem: The problem.
         trail: The finished search.
         assessed: The uncertainty without richer paths.
-        progress: Called with the stage, the work done and the total.
+        progress: Called with the stage, the work done and the total work.
     """
     changes = lacking(problem)
     if assessed.posterior is None or not changes:
@@ -67,7 +67,9 @@ def assess_richer_paths(
     try:
         paths = setup.trace(materials, with_stage(progress, "tracing more paths"))
     except (InputError, EngineError) as error:  # for example too many paths; the calibration is finished
-        _LOG.warning("paths with %s could not be tried: %s", " and ".join(changes), error)
+        _LOG.warning(
+            "the trace with %s failed, so richer paths are not considered: %s", " and ".join(changes), error
+        )
         return assessed
     start_stage(progress, "fitting more paths")
     richer = replace(problem, setup=setup, engine=replay(setup, paths))
@@ -77,7 +79,7 @@ def assess_richer_paths(
     method = LeastSquares(*problem.parameters.search_bounds, starts=STARTS[0], x0=trail.minima[:BASINS])
     fitted = search(richer, method, with_stage(progress, "fitting more paths"))
     calls = assessed.calls + fitted.rt_calls
-    # Screen by the likelihood ratio of Gaussian errors of unknown level, because draws take much longer.
+    # First test the likelihood ratio for Gaussian errors of unknown level, because draws take much longer.
     if (
         counted.sum() * (np.log(trail.best_value) - np.log(max(fitted.best_value, EXACT_DB)))
         < LIKELY_LOG_ODDS
@@ -109,7 +111,7 @@ def assess_richer_paths(
 
 
 def lacking(problem: Problem) -> dict[str, bool]:
-    """Tracer settings that find more paths than the study's settings; empty if there is nothing to try."""
+    """Tracer settings that find more paths than the study's settings; empty if no other settings can be tried."""
     study, counted = problem.setup.study, problem.objective.weight > 0
     traced = isinstance(problem.engine, Replay | ReplayCarriers) and study.rays_path is None
     displaced = any(displaces(name) for name in problem.parameters.names)

@@ -1,12 +1,13 @@
 """Draws from the joint posterior by tempered sequential Monte Carlo.
 
-A population is drawn from the prior, and tracks the prior times a power of the likelihood as the power grows to 1 (P.
-Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until half of
-the population is effective, resamples the population, and moves its members (`population_moves.py`).
+A population is drawn from the prior, and follows the prior times a power of the likelihood as the power grows to 1 (P.
+Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until the
+effective size of the population falls to one half, resamples the population, and moves its members
+(`population_moves.py`).
 
 We start with two independent populations, and double their number as long as the two halves of the populations disagree
-and the budget allows it. If they agree, each population is weighted by its estimate of the evidence, which is unbiased.
-Small populations that disagree are replaced by larger ones if the calibration made enough RT calls.
+and the budget permits. If the halves agree, each population is weighted by its estimate of the evidence, which is
+unbiased. Small populations that disagree are replaced by larger ones if the calibration made enough RT calls.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from calibray.uncertainty.joint_model import JointModel
 from calibray.uncertainty.population_moves import TINY, Lengths, Moves, Population, evaluated
 
 SIZE: Final = (64, 256)
-"""Smallest and largest number of members of a population."""
+"""Minimum and maximum number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
 """Number of interactions that all populations together may evaluate. With a budget 10 % smaller, the draws in Auckland
@@ -33,38 +34,41 @@ EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: the number of steps times the number of moves per step."""
 
 POPULATIONS: Final = (2, 4, 8)
-"""Numbers of independent populations; the number is increased as long as the two halves disagree. If several slab
-resonances fit, the mean of a population of 256 members scatters by 0.2 posterior standard deviations. In three
-development districts, the draws of two or four populations agree for half of the true scenes."""
+"""Possible numbers of independent populations; the number is increased as long as the two halves disagree. If several
+slab resonances fit the data, the mean of a population of 256 members scatters by 0.2 posterior standard deviations. In
+three development districts, two or four populations agree for half of the true scenes."""
 
 SWEEPS: Final = 4
-"""Number of sweeps per step; a sweep applies each kind of move to every member. The share of one of two distant ranges
-in five dimensions then scatters by 0.03 between seeds. With 2 sweeps, it scatters by 0.08."""
+"""Number of sweeps per step; a sweep applies each kind of move to every member. In a five-dimensional test with two
+distant ranges, the weight of one range then scatters by 0.03 between seeds. With 2 sweeps, this weight scatters by
+0.08."""
 
 LAST_SWEEPS: Final = (8, 48)
-"""Smallest and largest number of further sweeps at power 1. A population that is smaller because of the budget gets
-more sweeps, so it provides as many draws as a larger one. On a small program, the number of sweeps is as large as the
-budget allows. In districts of 300 to 800 interactions, distribution functions after 8, 24 and 48 sweeps differ by
-0.053, 0.043 and 0.036 from those of a million draws from the prior (`benchmarks/simulation_based.py --reference`). With
-8 sweeps of 104 members, widths of intervals differ by up to 13 % between seeds in Auckland, and with 16 by up to 8 %
-(`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Minimum and maximum number of further sweeps at power 1. A population that is smaller because of the budget gets more
+sweeps, so that it provides as many draws as a larger population. For a small path program, the number of sweeps is as
+large as the budget permits. The reference is a posterior from a million draws from the prior
+(`benchmarks/simulation_based.py --reference`). In districts with 300 to 800 interactions, distribution functions after
+8, 24 and 48 sweeps differ from this reference by 0.053, 0.043 and 0.036. In Auckland, the widths of intervals differ
+between seeds by up to 13 % with 8 sweeps of 104 members, and by up to 8 % with 16 sweeps (`benchmarks/certainty_cost.py
+--seeds 3`)."""
 
 KEPT: Final = 2
 """Number of sweeps at power 1 between two states of a member that are kept as draws."""
 
 EFFECTIVE: Final = 0.5
-"""Share of the population that stays effective when a step raises the power."""
+"""Fraction of the population that stays effective when a step raises the power."""
 
 MAX_STEPS: Final = 60
-"""Largest number of steps, the last of which raises the power to 1; most posteriors require 8 to 20 steps."""
+"""Maximum number of steps; the last step raises the power to 1, and most posteriors require 8 to 20 steps."""
 
 APART: Final = 0.2
-"""Largest distance between the distribution functions of a parameter in independent populations that agree. Two sets of
-256 independent draws differ by up to 0.12 in 19 of 20 cases; members of one population are not quite independent."""
+"""Independent populations agree if the distribution functions of every parameter differ by at most this distance. Two
+sets of 256 independent draws differ by up to 0.12 in 19 of 20 cases; the members of one population are not quite
+independent."""
 
 APART_BY_CHANCE: Final = 2.0
-"""Factor that sets this limit for small populations: the limit is the factor times sqrt(2 / n) for halves of n members
-each. A factor of 1.36 would be the 95 % point of independent draws (Kolmogorov and Smirnov)."""
+"""Factor that sets the limit `APART` for small populations: for halves with n members each, the limit is this factor
+times sqrt(2 / n). For independent draws, a factor of 1.36 would give the 95 % point (Kolmogorov and Smirnov)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +76,9 @@ class Posterior:
     """Draws from the joint posterior.
 
     Attributes:
-        means: Draws of the study's parameters, in its search space; each is the mean over all buildings.
-        seen: The same draws for the buildings with which the paths interact: the geometric means of their constants.
+        means: Draws of the study's parameters in the search space; each value is the mean over all buildings.
+        seen: The same draws for the buildings with which the paths interact: the geometric means of the constants of
+            these buildings.
         joint: Points of the unit cube of all parameters [n, d + k].
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
@@ -107,7 +112,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
 
 
 def population_size(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
-    """Number of members of each of two populations within a budget, for a given number of interactions per evaluation.
+    """Number of members of each of two populations, for a budget and a number of interactions per evaluation.
 
     Draws of several models are pooled with equal weight, so each model requires fewer members.
 
@@ -120,7 +125,7 @@ def population_size(interactions: int, budget: int = BUDGET, models: int = 1) ->
 
 
 def last_sweeps(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
-    """Number of sweeps at power 1 of each population; arguments as for `population_size`.
+    """Number of sweeps at power 1 for each population; the arguments are those of `population_size`.
 
     Example:
         >>> last_sweeps(1_000), last_sweeps(8_000), last_sweeps(50_000), last_sweeps(1_000, models=8)
@@ -142,9 +147,10 @@ def draw_posterior(
 ) -> Posterior:
     """Draw from the joint posterior.
 
-    After every step, `progress` is called with the share of the work done. The budget is the number of interactions
-    that may be evaluated; it is shared between the models if the draws of several models are pooled. If populations
-    disagree and are small because of the budget, larger ones are drawn with the largest budget instead.
+    After every step, `progress` is called with the completed fraction of the work. The budget is the number of
+    interactions that may be evaluated. If the draws of several models are pooled, these models share the budget. If
+    populations disagree and are small because of the budget, larger populations are drawn with `largest_budget`
+    instead.
     """
     posterior = _draw_populations(model, seed, progress, budget, models)
     sizes = [population_size(model.interactions, each, models) for each in (budget, largest_budget)]
@@ -179,7 +185,7 @@ def _draw_populations(
                 if progress is not None:
                     progress((number % 2 + share) / 2)
 
-            # A population does not depend on how many others there are.
+            # A population does not depend on the number of other populations.
             random = np.random.default_rng([seed, number])
             population, evidence = _anneal(model, size, sweeps, random, stepped)
             populations.append(population)
@@ -188,7 +194,7 @@ def _draw_populations(
         distance = _distance(model, [_together(populations[:half]), _together(populations[half:])])
         agree = distance < max(APART, APART_BY_CHANCE * float(np.sqrt(2.0 / (size * half))))
     members = len(populations[0].spread)
-    # Populations that disagree are weighted equally: the estimates of their evidence are then unreliable.
+    # Populations that disagree are weighted equally, because their estimates of the evidence are unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
     # Noise models were drawn uniformly, but the likelihood contains their weights.
@@ -206,7 +212,7 @@ def _distance(model: JointModel, populations: list[Population]) -> float:
     first, second = (each.point[:, : len(model.study)] for each in populations)
     distance = 0.0
     for one, other in zip(first.T, second.T, strict=True):
-        # The statistic of Kolmogorov and Smirnov.
+        # This is the Kolmogorov-Smirnov statistic.
         every = np.sort(np.concatenate([one, other]))
         shares = (np.searchsorted(np.sort(each), every, side="right") / len(each) for each in (one, other))
         distance = max(distance, float(np.abs(np.subtract(*shares)).max()))
@@ -239,12 +245,12 @@ def _anneal(
 ) -> tuple[Population, float]:
     """Members of a population after the power of the likelihood has been raised from 0 to 1, and the log evidence.
 
-    The states of the members during `last` sweeps at power 1 are kept. `stepped` is called with the share of the work
-    done; half of the work is done when the power reaches 1.
+    The states of the members during `last` sweeps at power 1 are kept. `stepped` is called with the completed fraction
+    of the work, which is one half when the power reaches 1.
     """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
-    # Uniform: the likelihood contains the weights of the models, and both are raised to the same power.
+    # Draw noise models uniformly, because the likelihood contains their weights, and both are raised to the same power.
     models = random.integers(0, len(model.marginal.models), size)
     empty = np.zeros(size)
     population = Population(
@@ -263,9 +269,10 @@ def _anneal(
         if step == MAX_STEPS - 1:
             power = 1.0
         rise = (power - before) * population.log_likelihood
-        # Logarithm of the mean of likelihood^rise: the ratio of successive normalising constants.
+        # The log evidence grows by the logarithm of the mean of likelihood^rise, the ratio of successive normalising
+        # constants.
         evidence += float(np.logaddexp.reduce(rise)) - np.log(size)
-        # Moves use differences between members at fixed index distances, so copies must not be neighbours.
+        # Moves use differences between members at fixed index distances, so copies of a member must not be neighbours.
         population = population.selected(
             random.permutation(systematic_resampling(_weights(rise), size, random))
         )
@@ -288,7 +295,7 @@ def _anneal(
 
 
 def _next_power(log_likelihood: NDArray[np.float64], power: float) -> float:
-    """The largest power for which the share `EFFECTIVE` of the members stays effective, by bisection."""
+    """The largest power for which a fraction `EFFECTIVE` of the members stays effective, found by bisection."""
 
     def effective_share(other: float) -> float:
         weight = _weights((other - power) * log_likelihood)

@@ -1,8 +1,9 @@
-"""Verdicts from draws of the posterior: credible interval, verdict and reason of every parameter.
+"""Verdicts from draws of the posterior: a credible interval, a verdict and a reason for every parameter.
 
-A credible set is the smallest set that contains a given share of the posterior. It has two pieces if two distant ranges
-fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B. W. Silverman,
-Density Estimation for Statistics and Data Analysis, 1986, section 5.2); they are mirrored at the bounds.
+A credible set is the smallest set that contains a given fraction of the posterior. It has two pieces if two distant
+ranges fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B. W.
+Silverman, Density Estimation for Statistics and Data Analysis, 1986, section 5.2). The kernels are mirrored at the
+bounds.
 
 If the posterior cannot be sampled, linear theory is used instead: intervals and covariances follow from the curvature
 of the sum of squares at the optimum.
@@ -30,7 +31,7 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
     `optimum` is the evaluation at the optimum, with derivatives.
     """
     parameters = problem.parameters
-    # Compressed residuals are scaled so that their sum of squares is that of the full residuals.
+    # Compressed residuals are scaled so that their sum of squares equals that of the full residuals.
     scale = np.sqrt(optimum.num_rows / optimum.residuals.shape[1])
     searched = linear_intervals(
         parameters.to_search(trail.best),
@@ -81,10 +82,10 @@ def linear_intervals(
     freedom = max(freedom, 1)
     quantile = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # of Student's t
     variance = float(residuals @ residuals) / freedom
-    # In units of the ranges, which makes the eigenvalues comparable.
+    # Scale the derivatives by the parameters' ranges, which makes the eigenvalues comparable.
     scaled = jacobian * (upper - lower)
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
-    # A direction without effect gets a large variance instead of an infinite one.
+    # A direction without effect gets a large but finite variance.
     values = np.maximum(values, values.max(initial=0.0) * 1e-12 + 1e-300)
     errors = np.sqrt(variance * ((vectors**2) @ (1 / values))) * (upper - lower)
     result = []
@@ -101,64 +102,66 @@ def linear_intervals(
 
 
 JUDGED: Final = 0.9
-"""Level of the credible sets on which the verdicts are based. The last few per cent of a 95 % interval can lie far from
-the rest, because of a noise model with a small weight."""
+"""Probability level of the credible sets on which the verdicts are based. The last few per cent of a 95 % interval can
+lie far from the rest, because of a noise model with a small weight."""
 
 IDENTIFIED: Final = 0.25
-"""Largest width of the credible set of an identified parameter, as a share of the range."""
+"""Maximum width of the credible set of an identified parameter, as a fraction of the range."""
 
 WEAKLY: Final = 0.5
-"""Largest width of the set of a weakly identified parameter, as a share of the range; above it, a parameter is not
-identifiable."""
+"""Maximum width of the credible set of a weakly identified parameter, as a fraction of the range; a parameter with a
+wider set is not identifiable."""
 
 NO_EFFECT_DB: Final = 1.0
-"""Change of path loss over a parameter's range below which no link counts as dependent on the parameter [dB]."""
+"""Change in path loss over a parameter's range below which a link counts as independent of the parameter [dB]."""
 
 END: Final = 0.1
-"""Largest distance of an interval's end from the bound, as a share of the range, that is attributed to chance if no
-link depends on the parameter."""
+"""Maximum distance between an interval's end and the bound, as a fraction of the range, that is attributed to chance if
+no link depends on the parameter."""
 
 TRADE_OFF: Final = 0.5
 """Rank correlation above which one parameter is reported to compensate for another."""
 
 LARGE_EFFECT: Final = 3.0
-"""Change of path loss, in standard deviations of the errors, above which a single link would determine the
+"""Change in path loss, in standard deviations of the errors, above which a single link would determine the
 parameter."""
 
 RANKED: Final = 400
 """Number of draws of equal weight from which rank correlations are computed."""
 
 LINE: Final = 25
-"""Number of values over the range of a parameter at which its effect is computed."""
+"""Number of values over the range of a parameter at which the effect of the parameter is computed."""
 
 QUANTILES: Final = 400
 """Number of quantiles that represent the draws."""
 
 GRID: Final = 101
-"""Number of equally spaced points over the whole range, in addition to the quantiles."""
+"""Number of equally spaced points over the whole range that are used in addition to the quantiles."""
 
 STEPS: Final = np.array([0.5, 1.0, 1.5, 2.0, 3.0])
-"""Distance of points beyond the outermost quantiles, in kernel widths."""
+"""Distances between the outermost quantiles and the points beyond these quantiles, in kernel widths."""
 
 KERNEL_SHARE: Final = 0.08
-"""Share of the draws within the width of a kernel, for up to 200 draws; more draws allow narrower kernels
+"""Fraction of the draws within the width of a kernel, for up to 200 draws; more draws allow narrower kernels
 (Silverman)."""
 
 MOST_INDEPENDENT: Final = 1000
-"""Largest number of draws that count as independent; further draws are mostly later states of the same members. In four
-districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. The sets for the constants of window glass have
-1.5 pieces on average, and those of the reference have 1.1. If all draws count as independent, the sets contain 0.87 to
-0.90, and those for window glass have 2.0 pieces (`benchmarks/simulation_based.py --reference`)."""
+"""Maximum number of draws that count as independent; further draws are mostly later states of the same members. In four
+districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. For the constants of window glass, these sets
+have 1.5 pieces on average, and the sets of the reference have 1.1. If all draws counted as independent, the 90 % sets
+would contain 0.87 to 0.90 of the reference posterior, and the sets for window glass would have 2.0 pieces
+(`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
-"""Smallest share of the posterior in a piece; smaller shares are attributed to chance."""
+"""Minimum fraction of the posterior in a piece; smaller fractions are attributed to chance."""
 
 REACH: Final = 8.5
 """Number of kernel widths beyond which the tail of a Gaussian is zero in double precision."""
 
 LEAST_GAP: Final = 0.03
-"""A gap between pieces is attributed to chance if it is narrower than both this share of the range and the wider piece.
-Pieces that all lie within this share of the range are merged, because a user would regard them as one value."""
+"""A gap between pieces is attributed to chance if it is narrower than both this fraction of the range and the wider
+piece. Pieces that all lie within this fraction of the range are merged, because a user would regard the pieces as one
+value."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -174,8 +177,8 @@ class Axes:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         value: Maps the index of a parameter and a search coordinate to the value that is stated in reasons.
-        customary: Usual widths of the parameters' ranges [d]; widths of the bounds if None. Shares refer to the smaller
-            width, so wider bounds do not improve a verdict.
+        customary: Usual widths of the parameters' ranges [d]; if None, the widths between the bounds. Fractions refer
+            to the smaller width, so that wider bounds do not improve a verdict.
     """
 
     names: Sequence[str]
@@ -185,7 +188,7 @@ class Axes:
     customary: NDArray[np.float64] | None = None
 
     def extent(self, index: int) -> float:
-        """Width of the range to which shares refer."""
+        """Width of the range to which fractions refer."""
         width = float(self.upper[index] - self.lower[index])
         return width if self.customary is None else min(width, float(self.customary[index]))
 
@@ -195,7 +198,7 @@ class JudgedSet:
     """The credible set of one parameter, with its verdict.
 
     Attributes:
-        pieces: Lower and upper ends of the pieces of the credible set, ascending and within the bounds.
+        pieces: Lower and upper ends of the pieces of the credible set, in ascending order and within the bounds.
         name: The verdict.
         reason: Its reason.
         seen: The pieces for the measured buildings; equal to `pieces` if the draws do not distinguish these buildings.
@@ -208,12 +211,12 @@ class JudgedSet:
 
     @property
     def lower(self) -> float:
-        """Lower end of the hull of all pieces."""
+        """Lower end of the lowest piece."""
         return self.pieces[0][0]
 
     @property
     def upper(self) -> float:
-        """Upper end of the hull of all pieces."""
+        """Upper end of the highest piece."""
         return self.pieces[-1][1]
 
 
@@ -226,10 +229,10 @@ def verdicts(
     level: float = 0.95,
     seen: Draws | None = None,
 ) -> list[JudgedSet]:
-    """Judge every parameter by its posterior; if buildings differ, by the posterior of the mean over all buildings.
+    """Judge every parameter by its posterior or, if buildings differ, by the posterior of the mean over all buildings.
 
-    The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the share `level` of the posterior.
-    `seen` is the posterior for the measured buildings; if None, `draws` is used.
+    The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the fraction `level` of the
+    posterior. `seen` is the posterior for the measured buildings; if None, `draws` is used.
     """
     best = draws.point[np.argmax(draws.density)]
     seen = draws if seen is None else seen
@@ -246,7 +249,8 @@ def verdicts(
         share, seen_share = _width(pieces) / extent, _width(seen_pieces) / extent
         range_ = {"customary": True} if extent < upper - lower else {}
         seen_ends = _bounds_reached(seen_pieces, lower, upper)
-        # If the posterior for all buildings is flat, its set reaches both bounds, and its pieces are due to chance.
+        # If the posterior for all buildings is flat, the credible set reaches both bounds, and its pieces are due to
+        # chance.
         judged = pieces if share <= WEAKLY else seen_pieces
         ends = _bounds_reached(judged, lower, upper) or seen_ends
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not seen_ends:
@@ -293,7 +297,7 @@ def _bounds_reached(pieces: tuple[tuple[float, float], ...], lower: float, upper
 def _without_chance(
     pieces: tuple[tuple[float, float], ...], lower: float, upper: float
 ) -> tuple[float, float]:
-    """One range for a parameter without effect: gaps between pieces and short distances to a bound count as chance."""
+    """One range for a parameter without effect; gaps between pieces and short distances to a bound are ignored."""
     low, high, slack = pieces[0][0], pieces[-1][1], END * (upper - lower)
     return lower if low - lower < slack else low, upper if upper - high < slack else high
 
@@ -315,7 +319,7 @@ def _outlying_pieces(
     draws: Draws,
     axes: Axes,
 ) -> tuple[tuple[float, float, float], ...]:
-    """Pieces of the reported interval outside the judged set, with their weights; usually none."""
+    """Pieces of the reported interval that lie outside the judged set, with their weights; usually there are none."""
     others, value = [], draws.point[:, index]
     for low, high in reported:
         if not any(start <= high and low <= end for start, end in pieces):
@@ -325,7 +329,7 @@ def _outlying_pieces(
 
 
 def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axes) -> float:
-    """Largest change of a link's path loss over the range of a parameter, with the other parameters fixed [dB]."""
+    """Largest change in a link's path loss over the range of a parameter, with the other parameters fixed [dB]."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(axes.lower[index], axes.upper[index], LINE)
     loss = modelled(line)
@@ -333,9 +337,9 @@ def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axe
 
 
 def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
-    """The reason why most of the range fits although links depend on the parameter: trade-offs or large errors."""
+    """The reason why most of the range fits, although links depend on the parameter: a trade-off or large errors."""
     drawn = draws.point[systematic_resampling(draws.weight, RANKED, np.random.default_rng(0))]
-    # Spearman's correlation is that of the ranks.
+    # Spearman's correlation is the correlation of the ranks.
     rank = np.argsort(np.argsort(drawn, axis=0), axis=0)
     varied = np.ptp(rank, axis=0) > 0
     correlation = np.zeros(len(names))
@@ -352,7 +356,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval, with an ambiguous verdict instead of an identified one if it excludes the calibrated value."""
+    """The interval; if it excludes the calibrated value, an identified verdict is replaced with an ambiguous one."""
     identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
@@ -367,9 +371,9 @@ def credible_sets(
     upper: float,
     levels: Sequence[float],
 ) -> list[tuple[tuple[float, float], ...]]:
-    """For each level, the smallest set that contains this share of the posterior, from one smoothed density.
+    """For each level, the smallest set that contains this fraction of the posterior, from one smoothed density.
 
-    Draws [n] have weights [n]. A set consists of the lower and upper ends of its pieces, ascending.
+    Draws [n] have weights [n]. A set consists of the lower and upper ends of its pieces, in ascending order.
 
     Example:
         >>> draws = np.random.default_rng(0).normal(5.0, 0.1, 4000)
@@ -379,7 +383,7 @@ def credible_sets(
     """
     width = upper - lower
     edges, mass = _masses((value - lower) / width, weight)
-    # Intervals in order of decreasing density, until the level is reached.
+    # Add intervals in order of decreasing density until the level is reached.
     order = np.argsort(-mass / np.diff(edges), kind="stable")
     covered, sets = np.cumsum(mass[order]), []
     for level in levels:
@@ -399,7 +403,7 @@ def _masses(
     total = np.cumsum(weight[order]) / weight.sum()
     index = np.searchsorted(total, (np.arange(QUANTILES) + 0.5) / QUANTILES)
     quantile = unit[order][np.minimum(index, len(unit) - 1)]
-    # A kernel is as wide as the range that a share of the draws spans, on the side where they are denser.
+    # A kernel is as wide as the range spanned by a fraction of the draws, on the side where the draws are denser.
     near = round(QUANTILES * KERNEL_SHARE * min(1.0, (200.0 / independent) ** 0.2))
     above, below = np.full(QUANTILES, np.inf), np.full(QUANTILES, np.inf)
     above[:-near] = below[near:] = quantile[near:] - quantile[:-near]
