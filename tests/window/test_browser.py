@@ -226,7 +226,7 @@ def test_a_column_of_heights_is_refused_for_a_plan(walked):
     height = step(page, "Map or plan").get_by_label("Height: a column, or metres")
     height.fill("storeys")
     step(page, "Map or plan").get_by_role("button", name="Make the scene").click()
-    page.get_by_text("Height storeys: must be a number of metres").wait_for()
+    page.get_by_text("Height storeys: must be a number [m]").wait_for()
     assert command(page) == before
     height.fill("")
     page.wait_for_timeout(300)

@@ -49,7 +49,7 @@ def test_the_result_of_less_error_in_the_blocks_predicts_better_in_either_order(
     assert said.partition(";")[0] == better("new", "old", folder).partition(";")[0]
     assert said.startswith("new predicts better than old: RMSE ")
     assert "on 200 held-out links" in said
-    assert said.endswith("lower in 4 of 4 blocks of old.")
+    assert said.endswith("The RMSE is lower in 4 of 4 blocks of old.")
 
 
 def test_equal_errors_are_not_called_better(results):
@@ -73,7 +73,7 @@ def test_results_without_links_in_common_are_not_compared(results):
 def test_a_result_is_not_compared_with_itself(results):
     planted, folder = results
     planted.update(old=held_out(3.0, 1))
-    with pytest.raises(InputError, match="old: chosen twice; choose two results"):
+    with pytest.raises(InputError, match="old: chosen twice; choose two different results"):
         better("old", "old", folder)
 
 

@@ -106,8 +106,11 @@ def test_of_a_file_that_is_not_a_study_the_page_shows_no_values(folder, wrong):
 
 def test_a_study_with_an_error_need_not_be_drafted_again(folder):
     for text, shown in (
-        (STUDY.replace("version = 1", "version = = 1"), "study.toml has an error, shown under Measurements."),
-        (STUDY + "[trcae]", "study.toml has an error, shown under Measurements."),
+        (
+            STUDY.replace("version = 1", "version = = 1"),
+            "study.toml has an error, which is shown under Measurements.",
+        ),
+        (STUDY + "[trcae]", "study.toml has an error, which is shown under Measurements."),
         (None, "Draft the study first."),
     ):
         folder.study_file.unlink(missing_ok=True) if text is None else folder.study_file.write_text(text)
@@ -132,7 +135,7 @@ def test_a_carrier_that_is_no_number_is_named_and_starts_nothing(tmp_path, monke
         for value in ("2,44 GHz", "2.44e9"):
             field.value = value
             press.handler(None)
-    assert shown == ["Carrier frequency [Hz]: 2,44 GHz, must be a number such as 2.44e9"]
+    assert shown == ["Carrier frequency [Hz]: 2,44 GHz: must be a number such as 2.44e9"]
     assert started == ["--frequency=2.44e9"]
 
 

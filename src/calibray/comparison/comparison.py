@@ -1,8 +1,8 @@
-"""Comparison of methods at equal budgets: every method runs with many seeds on one problem.
+"""Comparison of methods at equal budgets: every method runs on one problem with many seeds.
 
-The result is the excess of every method as a function of the number of RT calls, as arrays, tables, files and a figure.
-The excess is the best objective so far minus the global optimum on the same data. The optimum comes from least squares
-with many starts, or from another search that reached a lower value.
+The result is the excess of every method versus the number of RT calls, as arrays, tables, files and a figure.
+The excess is the best objective so far minus the global optimum on the same data. The optimum is found by least squares
+with many starts, or by another search that reached a lower value.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from calibray.errors import EngineError, InputError
 from calibray.optimizers import METHODS, Optimizer, label
 from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.support.figure_style import write as write_figure
-from calibray.support.messages import did_you_mean
+from calibray.support.messages import counted, did_you_mean
 from calibray.support.output_files import check_folder, write_table
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers, short_html, short_text
@@ -75,7 +75,7 @@ class Comparison:
     found_by: str
 
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
-        """Excess of every run [seeds], [dB], after a number of RT calls.
+        """Excess of every run [seeds], [dB], after `calls` RT calls.
 
         A run that ended earlier keeps its final excess. The excess is +inf before the first evaluation.
         """
@@ -87,16 +87,16 @@ class Comparison:
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
     def calls_to(self, name: str, excess_db: float) -> NDArray[np.float64]:
-        """Number of RT calls after which each run reached an excess [seeds]; +inf for runs that never reached it."""
+        """Number of RT calls after which each run reached an excess [seeds]; +inf for runs that did not reach it."""
         return np.array([run.first(self.optimum + excess_db) for run in self.runs[name]])
 
     def table(self) -> pd.DataFrame:
-        """One row per method: the excess after given numbers of RT calls, and the RT calls needed for given excesses.
+        """One row per method: the excess after given numbers of RT calls, and the RT calls to reach given excesses.
 
         The table contains the median, the quartiles and the worst excess after 30, 60 and 225 RT calls and at the end.
-        For each given excess, it contains the median number of RT calls to reach it (empty if at least half of the runs
-        did not reach it) and the number of runs that reached it. Further columns contain the number of failed runs and
-        the median duration of a run [s].
+        For each given excess, the table contains the number of runs that reached this excess and the median number of
+        RT calls that they needed. The median is empty if at least half of the runs did not reach the excess. Further
+        columns contain the number of failed runs and the median duration of a run [s].
         """
         return pd.DataFrame([self._row(method) for method in self.methods])
 
@@ -107,7 +107,7 @@ class Comparison:
         ]
 
     def history(self) -> pd.DataFrame:
-        """One row per improvement and one for the last RT call of every run: method, seed, call, best_db, failure."""
+        """One row per improvement and one row for the last RT call of a run: method, seed, call, best_db, failure."""
         parts = [
             pd.DataFrame(
                 {
@@ -141,7 +141,7 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             column = "end" if calls is None else str(calls)
-            # With a smaller budget, there is no value at this number of calls. 2^62 calls stand for the end of the run.
+            # With a smaller budget, there is no value at this number of calls. 2^62 calls represent the end of the run.
             reached = calls is None or method.stops_by_itself or calls <= method.budget
             excess = self.excess(method.name, 2**62 if calls is None else calls)
             for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
@@ -157,7 +157,7 @@ class Comparison:
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile of values [n], by linear interpolation; +inf if it involves an infinite order statistic.
+    """A quantile of values [n], by linear interpolation; +inf if the interpolation involves an infinite value.
 
     Example:
         >>> import numpy as np
@@ -172,7 +172,7 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
 
 
 def table(comparison: Comparison) -> Table:
-    """One row per method: median excesses, RT calls needed for given excesses, and number of runs that reached them."""
+    """One row per method: median excesses, and the RT calls and number of runs that reached given excesses."""
     records = comparison.table().to_dict("records")
     rows = tuple(_cells({str(key): value for key, value in record.items()}) for record in records)
     return Table("", COLUMNS, rows)
@@ -220,7 +220,7 @@ def _summary(comparison: Comparison) -> tuple[Table | str, ...]:
 
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4
-"""Smaller excesses are drawn at this value [dB]."""
+"""Lower limit of the excess in the figure [dB]; smaller excesses are drawn at this value."""
 
 
 def write(comparison: Comparison, folder: Path) -> None:
@@ -286,10 +286,10 @@ def compare(
             it once.
         methods: Methods with their budgets, as returned by `parse_methods`.
         seeds: Number of runs of each method.
-        out: Folder that keeps the runs.
+        out: Folder in which the runs are stored.
         workers: Number of processes.
         progress: Called after every run.
-        announce: Called before the first run, with a text that states the numbers of runs and RT calls.
+        announce: Called before the first run with a text that states the number of runs and of RT calls.
 
     Raises:
         InputError: A method, the number of seeds or workers, or the folder is invalid.
@@ -337,11 +337,11 @@ def compare(
 
 
 def _plan(methods: Sequence[BudgetedMethod], seeds: int, out: str | Path) -> str:
-    """A text that states the numbers of runs and RT calls."""
+    """A text that states the number of runs and of RT calls."""
     calls = seeds * sum(method.budget for method in methods if not method.stops_by_itself)
     free = "".join(f", not counting {method.name}" for method in methods if method.stops_by_itself)
     return (
-        f"{seeds * len(methods):,} runs with at most {calls:,} RT calls in total{free}; "
+        f"{counted(seeds * len(methods), 'run')} with at most {calls:,} RT calls in total{free}; "
         f"runs that are already stored in {out} are not repeated"
     )
 
@@ -361,7 +361,7 @@ def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ..
 
 
 def _search_optimum(problem: ComparisonProblem) -> MethodRun:
-    """Run least squares from so many starting points that its result can be taken as the global optimum."""
+    """Run least squares from enough starting points that the result can be regarded as the global optimum."""
     starts = OPTIMUM_STARTS[problem.large]
 
     def make() -> Optimizer:
@@ -380,7 +380,7 @@ def _search_optimum(problem: ComparisonProblem) -> MethodRun:
 def _lowest(
     earlier: float, reference: MethodRun, runs: dict[str, tuple[MethodRun, ...]]
 ) -> tuple[float, str]:
-    """The lowest objective of all searches, and the name of the first search that reached it to within rounding."""
+    """The lowest objective of all searches, and the name of the first search that reached it within rounding error."""
     ends = [(reference.at(reference.evaluations), "many-start least squares"), (earlier, "earlier searches")]
     for name, finished in runs.items():
         ends += [(run.at(run.evaluations), f"{name}, seed {run.seed}") for run in finished]
@@ -413,7 +413,7 @@ def _finished(
 
 
 def _start(open_problem: OpenProblem) -> None:
-    """Open the problem in a worker process, once for all runs of the process, which ends with its parent process."""
+    """Open the problem once for all runs of a worker process, and end this process when its parent process ends."""
     global _opened
     parent = parent_process()
     if parent is not None:

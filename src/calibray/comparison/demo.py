@@ -1,7 +1,7 @@
-"""The paper's experiment: the demo district is calibrated with GWO, SGWO-IM, space mapping and `auto`.
+"""The paper's experiment, which calibrates the demo district with GWO, SGWO-IM, space mapping and `auto`.
 
-Space mapping runs on the engine "retrace", which traces again for every candidate and represents engines without stored
-paths. The cheap model replays a trace with fewer interactions. `auto` runs on stored paths.
+Space mapping runs on the engine "retrace", which traces the scene again for every candidate and so represents engines
+without stored paths. Its cheap model replays a trace with fewer interactions per path. `auto` runs on stored paths.
 """
 
 from __future__ import annotations
@@ -88,14 +88,14 @@ def write_demo(demo: Demo, out: Path) -> Path:
 
 
 def _space_mapping(setup: Setup, seed: int, progress: Progress | None) -> Result:
-    """Run space mapping on the engine "retrace"; its cheap model replays a trace with fewer interactions."""
+    """Run space mapping on the engine "retrace"; the cheap model replays a trace with fewer interactions per path."""
     content = setup.study.content()
     method = {"name": MAPPING, "seed": seed, "options": {"budget": MAPPING_CALLS}}
     expensive, cheap = (
         Setup.open(Study.from_content(content | changes, setup.study.path), setup.factory)
         for changes in (
             {"method": method, "engine": {"name": "retrace"}},
-            # The study allows twice as many interactions.
+            # The study allows twice as many interactions per path.
             {"trace": content["trace"] | {"max_depth": 2}},
         )
     )
@@ -148,7 +148,7 @@ class Demo:
         return f"The paper's experiment, engine {self.engine}"
 
     def content(self) -> dict[str, Any]:
-        """The experiment as a dictionary, including the paper's results."""
+        """The experiment as a dictionary, including the results of the paper."""
         return {
             "engine": self.engine,
             "optimum_db": self.optimum_db,
@@ -167,7 +167,7 @@ class Demo:
 
 
 def cost(demo: Demo) -> Table:
-    """RT calls and time of every method, and the paper's values."""
+    """RT calls and time of every method, and the values that the paper reports."""
     columns = (
         Column("method"), numbers("RT calls"), numbers("time", "s"),
         numbers("paper: calls"), numbers("paper: time", "s"),
@@ -185,7 +185,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities found by every method, the true values, and the paper's values for its own site."""
+    """Permittivities found by every method, the true values, and the values that the paper reports for its own site."""
     columns = (
         Column("material"),
         Column("before"),
@@ -205,7 +205,7 @@ def permittivity(demo: Demo) -> Table:
 
 
 def accuracy(demo: Demo) -> Table:
-    """RMSE before and after calibration, and its excess over the global optimum."""
+    """RMSE before and after calibration, and the excess over the global optimum."""
     columns = (
         Column("method"), numbers("before"), numbers("after"), numbers("excess"), numbers("paper: after")
     )  # fmt: skip

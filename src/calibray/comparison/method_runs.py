@@ -37,12 +37,12 @@ class ComparisonProblem:
         fingerprint: Digest of everything that determines an evaluation.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Starting point given by the user [d]; None if there is none.
-        starts: Number of further starting points for methods that use several; None for their default.
+        start: Starting point given by the user [d]; None if the user gave no starting point.
+        starts: Number of further starting points for methods that use several points; None for the methods' default.
         large: Whether evaluations are too expensive for a reference search with many starts.
         minimum: Lowest objective known in advance; +inf if unknown.
         evaluate: The function to minimise.
-        cheap_model: Function that makes a cheap model of `evaluate`; None if there is none.
+        cheap_model: Function that makes a cheap model of `evaluate`; None if there is no cheap model.
         wrong_constants: Whether the cheap model has wrong constants.
     """
 
@@ -72,12 +72,12 @@ def study_problem(path: str | Path) -> ComparisonProblem:
             "'replay' to compare methods on stored paths"
         )
     setup = Setup.open(study.replace(engine="replay"))
-    # The replay engine always gives derivatives.
+    # The replay engine always provides derivatives.
     engine = cast(engines.Differentiable, engines.make(setup))
     problem = with_preliminary_fits(Problem.of(setup, engine))
     objective, parameters = problem.objective, problem.parameters
     lower, upper = parameters.search_bounds
-    # Everything that changes an evaluation: the study without its method, the files, and the data derived from these.
+    # Record everything that changes an evaluation: the study without its method, the files, and data derived from both.
     content = {key: section for key, section in problem.setup.study.content().items() if key != "method"}
     record = (
         fingerprint(setup),
@@ -106,7 +106,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
 
 
 LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
-"""Largest accepted values; a comparison with larger values would take impractically long."""
+"""Maximum accepted values; a comparison with larger values would take impractically long."""
 
 RunKey = tuple[str, int, int]
 """Method, budget and seed, which identify a run on a problem."""
@@ -119,7 +119,7 @@ class BudgetedMethod:
     Attributes:
         name: Name of the method in tables, as requested.
         method: Name of the method in `METHODS`.
-        budget: Largest number of RT calls.
+        budget: Maximum number of RT calls.
     """
 
     name: str
@@ -167,7 +167,7 @@ class BudgetedMethod:
         """Make the optimizer of a run, which respects the budget or stops by itself.
 
         Raises:
-            InputError: The method does not suit the problem, or its library is not installed.
+            InputError: The method is not suitable for the problem, or its library is not installed.
         """
         return optimizers.make(
             self.method,
@@ -191,13 +191,13 @@ class MethodRun:
 
     Attributes:
         method: The method.
-        budget: Largest number of RT calls; 0 if the method stops by itself.
+        budget: Maximum number of RT calls; 0 if the method stops by itself.
         seed: Seed of the run.
         evaluations: Number of RT calls in the run.
-        calls: Numbers, counted from 1, of the RT calls that improved on all earlier calls.
+        calls: Indices, counted from 1, of the RT calls with a lower objective than all earlier calls.
         best: Objectives of these calls [dB].
         seconds: Duration [s].
-        failure: The error that ended the run; empty if it finished.
+        failure: The error that ended the run; empty if the run finished.
     """
 
     method: str
@@ -215,7 +215,7 @@ class MethodRun:
         return self.best[index - 1] if index else np.inf
 
     def first(self, objective: float) -> float:
-        """Number of the first RT call that reached an objective [dB]; +inf if none did."""
+        """Index, counted from 1, of the first RT call that reached an objective [dB]; +inf if no call did."""
         return next(
             (float(call) for call, value in zip(self.calls, self.best, strict=True) if value <= objective),
             np.inf,
@@ -244,9 +244,9 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
 class RunFile:
     """Finished runs of one problem, in a JSON Lines file that can also contain runs of other problems.
 
-    Runs are appended one by one, so an interrupted comparison continues where it stopped. Failed runs in the file are
-    ignored and are therefore repeated. The file is created when the first run is added. `problem` is a digest of
-    everything, except the method, budget and seed, that determines a run.
+    Runs are appended one by one, so that an interrupted comparison continues where it stopped. Failed runs in the file
+    are ignored, so they are repeated. The file is created when the first run is added. `problem` is a digest of
+    everything that determines a run, except for the method, budget and seed.
 
     Raises:
         InputError: The file contains something other than runs.

@@ -1,6 +1,6 @@
-"""State shared by the steps of the window: the study's folder, its commands, selections, and the scene in 2-D and 3-D.
+"""State shared by the steps of the window: the study's folder, commands, selections, and the scene in 2-D and 3-D.
 
-The window uses only those files of the folder that the command line also reads and writes.
+In this folder, the window uses only files that the command line also reads and writes.
 
 In 3-D, lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin, because the page's camera
 shows distances of 0.1 to 1000 units.
@@ -53,13 +53,13 @@ PREDICTED: Final = "-predicted.csv"
 """Suffix of the names of predicted tables."""
 
 LARGEST: Final = 2**30
-"""Largest size of an uploaded file [bytes]; larger files must be copied into the folder by other means."""
+"""Maximum size of an uploaded file [bytes]; larger files must be copied into the folder by other means."""
 
 Control = TypeVar("Control", bound=ValueElement)
 
 _NAME: Final = re.compile(r"[\w][\w .()+-]*")
 _LONGEST_NAME: Final = 200
-"""Largest length of a file name [bytes]; file systems accept 255, and files derived from a scene have longer names."""
+"""Maximum length of a file name [bytes]; file systems accept 255, but files derived from a scene have longer names."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ class StudyFolder:
         return sorted(file.name for file in candidates if file.is_file() and not file.name.startswith("."))
 
     def tables(self) -> list[str]:
-        """Names of the tables in the folder, except those that the window writes."""
+        """Names of the tables in the folder, except for tables written by the window."""
         written = (PLACE, CANDIDATES, SUGGESTED)
         return [name for name in self.files(TABLES) if name not in written and not name.endswith(PREDICTED)]
 
     def scenes(self) -> list[str]:
-        """The scenes in the folder and its subfolders, except those in results."""
+        """The scenes in the folder and its subfolders, except for the scenes in results."""
         files = [*self.path.glob("*.xml"), *self.path.glob("*/*.xml")]
         names = (file.relative_to(self.path).as_posix() for file in files if file.name != "result-scene.xml")
         return sorted(name for name in names if not name.startswith("."))
@@ -118,7 +118,7 @@ class StudyFolder:
         Raises:
             InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
         """
-        # Some systems encode an umlaut as a letter and a combining mark; some scripts always need combining marks.
+        # Some systems encode an umlaut as a letter and a combining mark, and some scripts always need combining marks.
         name = unicodedata.normalize("NFC", name)
         letters = "".join(letter for letter in name if not unicodedata.category(letter).startswith("M"))
         shown = shortened(repr(name))
@@ -155,7 +155,7 @@ class StudyFolder:
         return content
 
     def text(self) -> str:
-        """The text of the study file; empty if there is none."""
+        """The text of the study file; empty if there is no study file."""
         try:
             return self.study_file.read_text(encoding="utf-8", errors="replace")
         except OSError:
@@ -168,7 +168,7 @@ class StudyFolder:
         return reasons_in(self.text())
 
     def save(self, content: Mapping[str, Any]) -> None:
-        """Write the study file, with its reasons as comments.
+        """Write the study file, with the reasons for settings as comments.
 
         Raises:
             InputError: The content is not a valid study; the file is unchanged.
@@ -180,7 +180,7 @@ class StudyFolder:
         write_text(self.study_file, text)
 
     def set_aside(self) -> None:
-        """Rename the study file, so that another study can be drafted."""
+        """Rename the study file so that another study can be drafted."""
         number = 1
         while (target := self.path / f"study-{number}.toml").exists():
             number += 1
@@ -213,7 +213,7 @@ class Solid:
 
 
 def solid(folder: StudyFolder, scene: str | None) -> Solid | None:
-    """The scene of the study, or the chosen scene if there is no study; None if there is no scene.
+    """The study's scene in 3-D, or the chosen scene if there is no study; None if there is no scene.
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -247,7 +247,7 @@ def filled(control: ui.number) -> float:
 
 @dataclass
 class Desk:
-    """The state of the page. There is one user, so all tabs use the same state.
+    """The state of the page. The page has one user, so all tabs use the same state.
 
     Attributes:
         folder: The study's folder.
@@ -258,7 +258,7 @@ class Desk:
         findings: Warnings about suspicious links.
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
-        edits: Functions that write the values shown in a step into the study's content, by tab and step.
+        edits: Functions that copy the values shown in a step to the study's content, by tab and step.
         show_again: Functions that redraw all steps after a change in a tab, by tab.
         drawn: Content of the steps when they were last drawn; see `page`.
     """
@@ -279,7 +279,7 @@ class Desk:
         self.jobs = Jobs(self.folder.path)
 
     def start(self, words: Sequence[object]) -> None:
-        """Start a command, and notify the user of its start or of the reason for a failure."""
+        """Start a command, and tell the user that it has started or why it could not start."""
         with self.messages():
             job = self.jobs.start([str(word) for word in words])
             ui.notify(f"Started: {job.command}", type="info", color="primary")
@@ -295,7 +295,7 @@ class Desk:
         ui.run_javascript(f"plan.mark({json.dumps(self.point)}, {json.dumps(area)})")
 
     def keep(self, control: Control) -> Control:
-        """Restore the value that was entered in a control before its step was redrawn, if it is still an option."""
+        """Restore the value entered in a control before its step was redrawn, if the value is still an option."""
         name = control.text if isinstance(control, ui.switch) else str(control.props["label"])
         if name in self.entered and self.entered[name] in getattr(control, "options", [self.entered[name]]):
             control.set_value(self.entered[name])
@@ -303,7 +303,7 @@ class Desk:
         return control
 
     def edit(self, step: str, write: Callable[[dict[str, Any]], None]) -> None:
-        """Register the function that writes the values of a step of this tab when the study is saved."""
+        """Register a function that, when the study is saved, writes the values shown in a step of this tab."""
         self.edits[ui.context.client.id, step] = write
 
     async def save(self) -> None:
@@ -329,9 +329,9 @@ class Desk:
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     """The map of the study, or of a scene in the folder if there is no study.
 
-    The map contains `west`, `north` [m], `scale` [1/m] and `height` of the outlines; `buildings` and `walls` as SVG
-    path data; `links`, each with x, y [m], path loss [dB], and 1 if it is suspicious, otherwise 0; `transmitters`, x,
-    y, z [m]; and `sites`.
+    The map contains `west`, `north` [m], `scale` [1/m] and `height` of the outlines, and the `sites`. It contains
+    `buildings` and `walls` as SVG path data. Each of the `links` has x, y [m], path loss [dB], and 1 if the link is
+    suspicious, otherwise 0. Each of the `transmitters` has x, y, z [m].
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -364,15 +364,17 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
     """The transmitters of the links, once per group and carrier frequency, because a mast can carry several sectors.
 
-    Each has a `name`, a position `tx` [m], and the values of the `columns` that a prediction requires, such as azimuth.
+    Each transmitter has a `name`, a position `tx` [m], and the values of the `columns` that a prediction requires, such
+    as azimuth.
     """
     names = [study.links.transmitter, *study.offset_groups, study.links.frequency]
     key = list(dict.fromkeys(name for name in names if name is not None and name in links.frame))
     columns = links.frame[list(dict.fromkeys([*key, *mounting_columns(study)]))]
     tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
-    # The first link of each mast, group and carrier frequency represents the others.
+    # The first link of each mast, group and carrier frequency represents the other links.
     first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
-    # Converted via JSON, because NumPy numbers and NaN cannot be sent to the page. Without columns, there are no rows.
+    # Convert the rows via JSON, because NumPy numbers and NaN cannot be sent to the page. Without columns, JSON has no
+    # rows.
     rows = json.loads(columns[first].to_json(orient="records")) or [{}] * int(first.sum())
     return [
         {
@@ -387,7 +389,7 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
 
 
 def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | None]:
-    """The scene to show (the study's scene, or else the chosen scene), and the study, if there is one.
+    """The scene to show (the study's scene or else the chosen scene), and the study if there is one.
 
     Raises:
         InputError: The study cannot be read.
@@ -401,7 +403,7 @@ def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | 
 
 
 def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
-    """A scene with the materials of the study, and the faces of the scene."""
+    """A scene with the study's materials, and the faces of the scene."""
     if study is None:
         # Only material names are used, and nearly all materials of ITU-R P.2040 have constants at 1 GHz.
         scene = read_scene(source, 1e9)
@@ -416,19 +418,19 @@ def grid_above_ground(
     """Points [n, 3], [m], of a grid with ascending, equally spaced x and y [m], at a height above the ground [m].
 
     Raises:
-        InputError: There is no scene, or it cannot be read.
+        InputError: There is no scene, or the scene cannot be read.
     """
     source, study = opened(folder, scene)
     if source is None:
-        raise InputError("heights above the ground require a scene: make or add one first")
+        raise InputError("heights above the ground require a scene; make or add a scene first")
     _, triangles = _geometry(source, study)
-    # Computed as in a coverage map, so that a place has the same height in both.
+    # Compute the heights as for a coverage map, so that a place has the same height in both.
     z = ground_heights(triangles, x, y) + height
     return np.stack([*np.meshgrid(x, y), z], axis=-1).reshape(-1, 3)
 
 
 def findings(folder: StudyFolder) -> list[str]:
-    """Warnings about suspicious links of a study, as sentences; empty without a study.
+    """Warnings about suspicious links of a study, as sentences; empty if there is no study.
 
     Raises:
         InputError: The scene or the links cannot be read.

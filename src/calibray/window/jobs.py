@@ -1,11 +1,11 @@
-"""Commands that were started in a study's folder by the window or from a terminal.
+"""Commands that were started in a study's folder, from the window or from a terminal.
 
 Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes it,
 `0001.log` contains its output, and `0001.exit` contains its exit status. A command without an exit status and without a
-process has died; starting it again resumes its work.
+process has died; if the command is started again, its work is resumed.
 
-`python -m calibray.window.jobs` runs one command in its own session, so that it outlives the server, and records its
-exit status. Ctrl-C is passed to the command, which keeps finished work.
+`python -m calibray.window.jobs` runs one command in its own session, so that the command outlives the server, and
+records the exit status. Ctrl-C is passed to the command, which keeps finished work.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WIDTH: Final = "80"
 """Number of characters per line in a command's tables."""
 
 TAIL: Final = 16_384
-"""Number of bytes shown from the end of a log, enough for a few screens."""
+"""Number of bytes shown from the end of a log, which is enough for a few screens."""
 
 
 _LINE: Final = re.compile(
@@ -88,12 +88,13 @@ class Jobs:
             raise InputError(f"{self._folder}: is a symbolic link; remove it")
         try:
             self._folder.mkdir(exist_ok=True)
-            # All files are considered, because a command that was never recorded may have left its log.
+            # All files are considered, because a command that was never recorded may have left a log.
             used = (int(file.stem) for file in self._folder.glob("[0-9]*.*") if file.stem.isdecimal())
             number = max(used, default=0) + 1
             stem = self._folder / f"{number:04d}"
             arguments = [sys.executable, "-m", "calibray.window.jobs", f"{stem}.exit", *words]
-            # The command writes while it runs; exclusive creation follows no link and replaces no file.
+            # The command writes to the log while it runs. Creating the log exclusively follows no link and replaces no
+            # file.
             output = os.fdopen(os.open(f"{stem}.log", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb")
             with output as log, _held_back(signal.SIGINT):
                 child = subprocess.Popen(
@@ -116,7 +117,7 @@ class Jobs:
         return [job for job in map(_read, files) if job is not None]
 
     def running(self) -> Job | None:
-        """The command that is currently running, if any."""
+        """The command that is currently running; None if no command is running."""
         return next((job for job in self.list() if job.state == "running"), None)
 
     def elsewhere(self) -> list[Job]:
@@ -133,13 +134,13 @@ class Jobs:
         return commands
 
     def stop(self, job: Job) -> None:
-        """Interrupt a command as Ctrl-C does; finished work is kept."""
+        """Interrupt a command as Ctrl-C would; finished work is kept."""
         with suppress(ProcessLookupError, PermissionError):
             if job.number:
                 os.killpg(job.pid, signal.SIGINT)
 
     def wait(self, job: Job, seconds: float) -> Job:
-        """Wait for a command for at most the given number of seconds; return it with its final state, or unchanged."""
+        """Wait at most the given number of seconds for a command; return it with its final state, or unchanged."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             now = next(other for other in self.list() if other.number == job.number)
@@ -151,7 +152,7 @@ class Jobs:
 
 @contextmanager
 def _held_back(number: signal.Signals) -> Iterator[None]:
-    """Block a signal in this thread and in the processes that it starts, which inherit the block."""
+    """Block a signal in this thread and in the processes that it starts, because they inherit the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield
@@ -179,7 +180,8 @@ def _state(exit_file: Path, pid: int, created: float) -> str:
         return {0: "done", 130: "stopped", -2: "stopped"}.get(int(exit_file.read_text()[:20]), "failed")
     with suppress(psutil.Error, OverflowError, ValueError):
         process = psutil.Process(pid)
-        # Another process may have received this ID since; it must not be mistaken for the command, or be stopped.
+        # Another process may have received this ID since then; that process must not be mistaken for the command or
+        # stopped.
         if abs(process.create_time() - created) < 1 and process.status() != psutil.STATUS_ZOMBIE:
             return "running"
     return "died"
@@ -203,7 +205,7 @@ class Stage:
         share: Completed fraction, 0 to 1; None if unknown.
         seconds: Elapsed time [s].
         left: Remaining time [s]; None if unknown.
-        best: Best value so far, such as "best RMSE 3.10 dB"; empty if the log contains none.
+        best: Best value so far, such as "best RMSE 3.10 dB"; empty if the log contains no value.
     """
 
     name: str
@@ -214,7 +216,7 @@ class Stage:
 
 
 def stages(log: str) -> list[Stage]:
-    r"""The stages in a log, in order; stages shorter than a few seconds print no progress line and are missing.
+    r"""The stages in a log, in order; stages of less than a few seconds print no progress line and are missing.
 
     Example:
         >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")
@@ -232,9 +234,9 @@ def stages(log: str) -> list[Stage]:
 
 
 def main() -> None:
-    """Run the command that follows the exit-status file in the arguments, unless it is stopped before it starts."""
+    """Run the command given after the exit-status file in the arguments, unless it is stopped before it starts."""
     stopped: list[int] = []
-    # A handler, unlike SIG_IGN, is not inherited by the command.
+    # Unlike SIG_IGN, a handler is not inherited by the command.
     signal.signal(signal.SIGINT, lambda number, _: stopped.append(number))
     # `Jobs.start` blocked this signal while Python started.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -36,14 +36,15 @@ HEAD: Final = '<link rel="stylesheet" href="/window/window.css"><script src="/wi
 
 def build(desk: Desk) -> None:
     """Build the page for one browser tab."""
-    # Separate for each tab: if one tab redraws its command, the others keep their buttons and the keyboard focus.
+    # Each tab has its own progress, so that other tabs keep their buttons and keyboard focus if one tab redraws its
+    # command.
     progress = ui.refreshable(_progress)
 
     @ui.refreshable
     def activity() -> None:
         _activity(desk, progress)
 
-    # Redraw all tabs now if the content has changed; otherwise a tab would soon redraw the steps of all tabs.
+    # If the content has changed, redraw all tabs now; otherwise, one tab would soon redraw the steps of all tabs.
     if _contents(desk) != desk.drawn:
         _redraw(desk)
     ui.colors(primary="#1f5fa8", negative="#a11d1d", positive="#1d6b3a", info="#1f5fa8")
@@ -54,7 +55,7 @@ def build(desk: Desk) -> None:
             for number, (name, show) in enumerate(STEPS, 1):
                 with ui.element("section").classes("step").props(f'aria-label="{name}"'):
                     heading(f"{number}. {name}", 2)
-                    # Placed outside the part that is redrawn, because redrawing would abort an upload.
+                    # The upload button is outside the part that is redrawn, because redrawing would abort an upload.
                     if name in UPLOADS:
                         upload(desk, UPLOADS[name])
                     show(desk)
@@ -80,20 +81,20 @@ def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
         )
         canvas.classes("map")
         with ui.row().classes("tools"):
-            # Handled in the browser, without the server, so that the map has changed before the next input.
+            # The browser handles these buttons without the server, so that the map has changed before the next input.
             for name, call in (("Whole map", "fit"), ("Draw an area", "drawArea")):
                 button = ui.button(name).props("outline dense")
                 button.on("click", js_handler=f"() => plan.{call}()")
             ui.button("Clear the area", on_click=clear_area).props("outline dense")
             view_button(desk)
-        ui.label("Drag to move, wheel or two fingers to zoom, click to choose a place.").classes("quiet")
+        ui.label("Drag to move, scroll or pinch to zoom, and click to choose a place.").classes("quiet")
         place = ui.label().classes("quiet").mark("place")
         activity()
     return place
 
 
 def _answer_map(desk: Desk, place: ui.label) -> None:
-    """Handle the events of the map's script: choices of the user, and loaded data."""
+    """Handle the events of the map's script: the user's choices and loaded data."""
 
     def picked(event: events.GenericEventArguments) -> None:
         # Adding 0 removes the sign of a negative zero.
@@ -124,9 +125,9 @@ def _answer_map(desk: Desk, place: ui.label) -> None:
 
 
 def _contents(desk: Desk) -> dict[str, object]:
-    """The content of the steps that are redrawn only if it changes, by step; and the running command.
+    """The content of the steps that are redrawn only if their content changes, by step, and the running command.
 
-    These steps have fields, which lose their focus if they are redrawn.
+    These steps have input fields, which lose the keyboard focus if they are redrawn.
     """
     text, files, job = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff")), desk.jobs.running()
     return {
@@ -158,7 +159,7 @@ def _follow_changes(
         ui.run_javascript(f"plan.load({json.dumps(desk.scene)})")
 
     def follow() -> None:
-        # Otherwise `watch` would redraw the command, and a click on its Stop button would be lost.
+        # Without this update, `watch` would redraw the command, and a click on its Stop button would be lost.
         watched.update(job=desk.jobs.running(), drawn=desk.drawn)
         activity.refresh()
         reload_map()
@@ -179,14 +180,14 @@ def _follow_changes(
                 activity.refresh()
         elif job != before:
             progress.refresh(job)
-        # A command that has ended may have written files. An editor may have changed the study; its text counts only
+        # A command that has ended may have written files. An editor may have changed the study. A new text counts only
         # if it is unchanged for a second, because a study that is being written can be incomplete.
         ended = job is None and desk.drawn["command"] is not None
         edited = text == watched["text"] != desk.drawn["Parameters"]
         watched.update(job=job, text=text)
         if ended or edited:
             _redraw(desk)
-        # This tab or another one has redrawn the steps of all tabs.
+        # This tab or another tab has redrawn the steps of all tabs.
         if watched["drawn"] != desk.drawn:
             follow()
 
@@ -202,7 +203,7 @@ def heading(text: str, level: int) -> None:
 
 
 def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
-    """Draw the running or most recent command, with the end of its output."""
+    """Draw the running command, or else the most recent command, with the end of its output."""
     jobs = desk.jobs.list()
     if not jobs:
         return
@@ -218,7 +219,7 @@ def _activity(desk: Desk, progress: Callable[[Job], None]) -> None:
 
 
 def _progress(job: Job) -> None:
-    """Draw the stages of a running command: earlier stages, progress of the last stage, and the best value so far."""
+    """Draw the stages of a running command: earlier stages, the last stage's progress, and the best value so far."""
     shown = stages(job.log)
     for stage in shown[:-1]:
         ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.best)))).classes("quiet")
@@ -255,7 +256,7 @@ class Camera:
     distance: float = 1.9 * RADIUS
 
     def move(self, turn: float = 0.0, rise: float = 0.0, factor: float = 1.0) -> None:
-        """Turn and raise the camera, and scale its distance; it cannot look straight down, where up is undefined."""
+        """Turn and raise the camera, and scale its distance; it never looks straight down, where up is undefined."""
         self.azimuth += turn
         self.elevation = float(np.clip(self.elevation + rise, 0.05, 1.5))
         self.distance = float(np.clip(self.distance * factor, 0.1 * RADIUS, 10 * RADIUS))
@@ -316,4 +317,6 @@ def _view(shown: Solid) -> None:
             with ui.element("span").classes("material"):
                 ui.element("span").classes("swatch").style(f"background: {color}")
                 ui.checkbox(name, value=True, on_change=lambda event, mesh=mesh: mesh.visible(event.value))
-    ui.label("Drag to turn, wheel to zoom. Blue: receivers; purple: transmitters.").classes("quiet")
+    ui.label("Drag to turn, and scroll to zoom. Receivers are blue, and transmitters are purple.").classes(
+        "quiet"
+    )

@@ -1,6 +1,6 @@
-"""The steps of the page from a study to its use: runs, results and predictions.
+"""The steps of the page that use a study: runs, results and predictions.
 
-Steps are redrawn after each command.
+These steps are redrawn after each command.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from calibray.window.study_steps import safe
 
 @ui.refreshable
 def show_run(desk: Desk) -> None:
-    """Draw the step for runs: calibration, validation, and all commands that have run or are running in the folder."""
+    """Draw the step for runs: calibration, validation, and all commands that ran or are running in the folder."""
     if desk.folder.study_file.is_file():
         with ui.row():
             out = desk.keep(ui.input("Name of the result", value="result"))
@@ -50,7 +50,7 @@ def show_run(desk: Desk) -> None:
 
         def start(words: list[object]) -> None:
             if not re.fullmatch(r"\w[\w-]*", out.value or ""):
-                ui.notify("Use letters, digits, _ and - in the name of a result.", type="negative")
+                ui.notify("Use only letters, digits, _ and - in the name of a result.", type="negative")
                 return
             desk.start(words)
 
@@ -70,7 +70,7 @@ RESUMED: Final = frozenset({"run", "validate", "trace", "predict", "map", "sugge
 
 @ui.refreshable
 def show_commands(desk: Desk) -> None:
-    """Draw the list of commands that have run or are running in the folder."""
+    """Draw the list of commands that ran or are running in the folder."""
     jobs = [*desk.jobs.elsewhere(), *desk.jobs.list()][:20]
     if not jobs:
         ui.label("Nothing has run here yet.").classes("quiet")
@@ -85,7 +85,7 @@ def _row(desk: Desk, job: Job) -> None:
     ui.label(job.state if job.number else f"{job.state}, in a terminal").classes(f"state {job.state}")
     ui.label(job.command).classes("command")
     if job.state in {"died", "stopped", "failed"} and RESUMED.intersection(job.words[:1]):
-        # The name starts with the text of the button, so that voice control finds it (WCAG 2.5.3).
+        # The accessible name starts with the text of the button, so that voice control finds the button (WCAG 2.5.3).
         ui.button("Resume", on_click=lambda: desk.start(job.words)).props(
             'outline dense aria-label="Resume: start this command again without repeating finished work"'
         )
@@ -234,17 +234,17 @@ def settings(study: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changes(studies: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Settings that differ between studies, by dotted name: the value in each study, or None where it is missing."""
+    """Settings that differ between studies, by dotted name: the value in each study, or None if it is missing."""
     tables = [settings(study) for study in studies]
     rows = {name: [table.get(name) for table in tables] for table in tables for name in table}
     return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
 
 
 def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
-    """The prediction model of a result, and its held-out errors; None if this model was not validated.
+    """The prediction model of a result, and the model's held-out errors; None if this model was not validated.
 
     Raises:
-        InputError: The result or its validation cannot be read, or they belong to different studies.
+        InputError: The result or its validation cannot be read, or the two belong to different studies.
     """
     fields = read(folder, allow_changed_inputs=True)
     held_out, model = fields["held_out"], fields["prediction"].model.name
@@ -252,13 +252,13 @@ def predictive_errors(folder: Path) -> tuple[str, HeldOutErrors] | None:
 
 
 def better(first: str, second: str, folder: Path) -> str:
-    """A sentence that states which of two results in a folder predicts held-out blocks better, and with what certainty.
+    """A sentence that states which of two results in a folder predicts held-out blocks better, and how certain this is.
 
     Raises:
-        InputError: Both are the same result, or a result or its validation cannot be read.
+        InputError: Both names are the same, or a result or its validation cannot be read.
     """
     if first == second:
-        raise InputError(f"{first}: chosen twice; choose two results")
+        raise InputError(f"{first}: chosen twice; choose two different results")
     results = {name: predictive_errors(folder / name) for name in (first, second)}
     if missing := [name for name, errors in results.items() if errors is None]:
         return f"{' and '.join(missing)}: not validated, so it is unknown which result predicts better. Validate both."
@@ -283,17 +283,17 @@ def better(first: str, second: str, folder: Path) -> str:
     return (
         f"{best} {verb} better than {worst}: RMSE {judgement.rmse_db:.2f} versus "
         f"{judgement.baseline_rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')} (difference "
-        f"{judgement.gain_db:.2f} dB{certainty}); lower in {lower} of {blocks} blocks of {first}."
+        f"{judgement.gain_db:.2f} dB{certainty}). The RMSE is lower in {lower} of {blocks} blocks of {first}."
     )
 
 
 MOST_CANDIDATES: Final = 2000
-"""Largest number of candidate positions; each one is traced."""
+"""Maximum number of candidate positions, each of which is traced."""
 
 
 @ui.refreshable
 def show_prediction(desk: Desk) -> None:
-    """Draw the step for predictions at a position or over an area, suggested measurement positions, and export."""
+    """Draw the step for predictions (at a position or over an area), suggested measurement positions, and export."""
     names = desk.folder.results()
     if not names:
         ui.label("Calibrate first.").classes("quiet")
@@ -381,9 +381,9 @@ def show_prediction(desk: Desk) -> None:
 def write_links(
     desk: Desk, file: str, site: dict[str, Any], x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> None:
-    """Write a table of links from a transmitter to a grid of positions x, y at a height above the ground, all [m].
+    """Write a table of links from a transmitter to a grid of positions x, y [m], at a height above the ground [m].
 
-    The links have the transmitter's groups, carrier and antenna direction.
+    The links have the transmitter's groups, carrier frequency and antenna direction.
 
     Raises:
         InputError: The scene cannot be read, or the table cannot be written.
@@ -398,11 +398,13 @@ def write_links(
 def _grid(desk: Desk, cell: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The x and y coordinates [m] of a regular grid in the chosen area."""
     if desk.area is None:
-        raise InputError("draw an area on the map first; its grid cells are the candidates")
+        raise InputError(
+            "draw an area on the map first; the grid cells of this area are the candidate positions"
+        )
     west, south, east, north = desk.area
     if (east - west) * (north - south) / cell**2 > MOST_CANDIDATES:
         raise InputError(
-            f"the area has more than {MOST_CANDIDATES} cells; draw a smaller area, or use wider cells"
+            f"the area has more than {MOST_CANDIDATES} cells; draw a smaller area, or use larger cells"
         )
     return np.arange(west, east, cell), np.arange(south, north, cell)
 
@@ -431,7 +433,7 @@ def predicted_text(row: pd.Series) -> str:
     for key, quantity in QUANTITIES.items():
         column = f"{key}_{quantity.unit.lower()}"
         if key != "path_loss" and column in row:
-            # The table has these columns only if the study measured this quantity.
+            # The table has these columns only if this quantity was measured.
             value, name, unit = column, quantity.name, quantity.unit
             lower, upper = (f"{key}_{end}_{unit.lower()}" for end in ("lower", "upper"))
     remark = row.get("remark")

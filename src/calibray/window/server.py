@@ -1,4 +1,4 @@
-"""The server of the window; only this machine can reach it, and a guard refuses unauthorized requests."""
+"""The server of the window, which only this machine can reach; a guard refuses unauthorized requests."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def application(desk: Desk) -> FastAPI:
         except InputError as error:
             return JSONResponse({"links": [], "transmitters": [], "sites": [], "error": str(error)})
 
-    # Served separately, so that the map need not wait for the findings.
+    # The findings are served separately, so that the map does not have to wait for them.
     @app.get("/data/findings.json")
     async def suspicions() -> Response:
         try:
@@ -75,7 +75,7 @@ def application(desk: Desk) -> FastAPI:
         path = desk.folder.path / name / file
         if not path.is_file():
             return Response("not written yet", 404)
-        # A report may come from elsewhere, so its scripts run in a separate origin and cannot send requests.
+        # A report may come from another machine, so its scripts run in a separate origin and cannot send requests.
         policy = "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
         return FileResponse(
             path, headers={"Content-Security-Policy": policy + "img-src data:; font-src data:"}
@@ -98,7 +98,7 @@ def _listen(port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind(("127.0.0.1", port))
-        # From here on, connections are queued, so that the address can be opened before the server runs.
+        # From here on, connections are queued, so the address can be opened before the server is running.
         listening.listen()
     except (OSError, OverflowError) as error:
         listening.close()
@@ -109,7 +109,7 @@ def _listen(port: int) -> socket.socket:
 
 
 POLICY: Final = (
-    # NiceGUI compiles its templates in the browser, which needs eval; nothing is loaded from elsewhere.
+    # NiceGUI compiles its templates in the browser, which requires eval; nothing is loaded from other hosts.
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; frame-src 'self'; worker-src 'self' blob:; "
     "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
@@ -128,7 +128,7 @@ class Guard:
     def __init__(self, app: Any, token: str, port: int) -> None:
         self._app, self._token, self._port = app, token.encode(), port
         self._hosts = {f"{name}:{port}".encode() for name in ("127.0.0.1", "localhost")}
-        # Cookies are shared between ports, so the cookie's name contains the port.
+        # All ports of a host share cookies, so the name of the cookie contains the port.
         self._cookie = f"calibray_{port}"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
@@ -140,17 +140,17 @@ class Guard:
         fault = self._fault(scope, headers)
         entering = scope["type"] == "http" and scope["path"] == "/" and self._given(scope)
         if fault is None and entering:
-            # The token disappears from the address bar and the history; the cookie replaces it.
+            # The token disappears from the address bar and the history; the cookie replaces the token.
             cookie = f"{self._cookie}={self._token.decode()}; HttpOnly; SameSite=Strict; Path=/".encode()
             await _answer(send, 303, b"", ((b"location", b"/"), (b"set-cookie", cookie)))
         elif fault is not None or not self._known(headers):
-            text = fault or "open the address that `calibray open` printed: this address has no valid token"
+            text = fault or "this address has no valid token; open the address that `calibray open` printed"
             await _refuse(scope, receive, send, 400 if fault else 403, text)
         else:
             await self._app(scope, receive, _with_headers(send))
 
     def _fault(self, scope: Any, headers: dict[bytes, bytes]) -> str | None:
-        """The reason to refuse a request regardless of its token; None if there is none."""
+        """The reason to refuse a request regardless of its token; None if the request is acceptable."""
         path = scope["path"]
         if ".." in path.split("/") or "\\" in path or not path.isprintable():
             return "the path is outside the window's pages"
@@ -159,7 +159,7 @@ class Guard:
         origins = {b"http://" + host for host in self._hosts}
         if b"origin" in headers and headers[b"origin"] not in origins:
             return "the request comes from another origin"
-        # A page from another port on this machine is same-site, so SameSite=Strict alone would not stop its requests.
+        # A page from another port of this machine is same-site, so SameSite=Strict alone would not stop its requests.
         if headers.get(b"sec-fetch-site", b"none") not in {b"none", b"same-origin"}:
             return "the request comes from another site"
         return None
@@ -198,7 +198,7 @@ async def _answer(send: Any, status: int, body: bytes, headers: tuple[tuple[byte
 
 
 def _with_headers(send: Any) -> Any:
-    """Add the window's headers to responses, and its content security policy unless a response has its own."""
+    """Add the window's headers to all responses, and its content security policy to responses without such a policy."""
 
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":

@@ -21,7 +21,7 @@ from calibray.window.desk import LARGEST, MAPS, STUDY, Desk, StudyFolder, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
-"""The command that converts a file to a scene, by file extension; other files can be footprints or plans."""
+"""The kind of conversion to a scene, by file extension; files with other extensions can be footprints or plans."""
 
 
 def upload(desk: Desk, label: str) -> None:
@@ -37,7 +37,10 @@ def upload(desk: Desk, label: str) -> None:
         desk.refresh()
 
     def refuse() -> None:
-        ui.notify(f"Larger than {LARGEST // 2**30} GiB: copy the file into the folder.", type="negative")
+        ui.notify(
+            f"The file is larger than {LARGEST // 2**30} GiB; copy it into the folder instead.",
+            type="negative",
+        )
 
     button = ui.button(label).props("outline")
     ui.label("Or drop files here:").classes("quiet")
@@ -52,7 +55,7 @@ def upload(desk: Desk, label: str) -> None:
 
 @ui.refreshable
 def show_scene(desk: Desk) -> None:
-    """Draw the step for the scene: convert a map, footprints or a floor plan, or choose a scene."""
+    """Draw the step for the scene: convert a map, footprints or a floor plan to a scene, or choose a scene."""
     sources, terrain = desk.folder.files(MAPS), desk.folder.files((".tif", ".tiff"))
     if sources:
         # A table is rarely a plan.
@@ -78,7 +81,7 @@ def show_scene(desk: Desk) -> None:
             )
             relief = desk.keep(ui.select(["", *terrain], label="Height model of the ground", value=""))
             apart = desk.keep(ui.switch("One mesh per building"))
-            # Only the settings that the chosen command has are shown.
+            # Only settings of the chosen kind of conversion are shown.
             height.bind_visibility_from(kind, "value", lambda value: value != "osm")
             for setting in (wall, thickness, ground, relief, apart):
                 setting.bind_visibility_from(kind, "value", lambda value: value != "plan")
@@ -90,7 +93,7 @@ def show_scene(desk: Desk) -> None:
                 words: list[object] = ["scene", kind.value, source.value, "--out", "scene"]
                 if kind.value == "plan":
                     if height.value and not _is_number(height.value):
-                        raise InputError(f"Height {height.value}: must be a number of metres")
+                        raise InputError(f"Height {height.value}: must be a number [m]")
                     words += ["--unit", unit.value] if unit.value else []
                     stated = filter(None, map(str.strip, (materials.value or "").split(",")))
                     words += [f"--material={material}" for material in stated]
@@ -112,9 +115,9 @@ def show_scene(desk: Desk) -> None:
     scenes = desk.folder.scenes()
     if of_study := desk.folder.valid_content().get("scene", {}).get("file", ""):
         ui.label(f"Scene of the study: {of_study}")
-        ui.label("To change it, edit the section scene under Measurements, or select Draft again.").classes(
-            "quiet"
-        )
+        ui.label(
+            "To change the scene, edit the section 'scene' under Measurements, or select 'Draft again'."
+        ).classes("quiet")
         return
     if desk.scene not in scenes:
         desk.scene = scenes[0] if scenes else None
@@ -140,7 +143,7 @@ def _is_number(text: str | None) -> bool:
 
 
 SECTIONS = ("scene", "links", "antennas", "trace", "offset")
-"""Sections with assumptions that the step for measurements lists; parameters have a separate step."""
+"""Sections whose assumptions are listed in the step for measurements; parameters have a separate step."""
 
 
 @ui.refreshable
@@ -154,7 +157,9 @@ def show_measurements(desk: Desk) -> None:
         return
     tables, tracks = desk.folder.tables(), desk.folder.files((".gpx",))
     if not tables:
-        ui.label("Add a table of measured links: text such as CSV, Excel or Parquet.").classes("quiet")
+        ui.label(
+            "Add a table of measured links: a CSV or other text file, an Excel file or a Parquet file."
+        ).classes("quiet")
         return
     likely_links, likely_sites = likely_tables(desk.folder, tables)
     with ui.row():
@@ -173,14 +178,14 @@ def show_measurements(desk: Desk) -> None:
             ui.notify("Make or add a scene first.", type="negative")
             return
         if frequency.value and not _is_number(frequency.value):
-            wrong = f"Carrier frequency [Hz]: {frequency.value}, must be a number such as 2.44e9"
+            wrong = f"Carrier frequency [Hz]: {frequency.value}: must be a number such as 2.44e9"
             ui.notify(wrong, type="negative")
             return
         words: list[object] = ["init", desk.scene, links.value, "--out", STUDY]
         options = {
             "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
         }  # fmt: skip
-        # Each option and its value form one word, so that a negative x is not mistaken for an option.
+        # Each option is joined to its value, so that a negative x is not mistaken for an option.
         words += [f"{option}={value}" for option, value in options.items() if value]
         desk.start(words)
 
@@ -189,7 +194,7 @@ def show_measurements(desk: Desk) -> None:
 
 @ui.refreshable
 def findings(desk: Desk) -> None:
-    """Draw the warnings about suspicious links; these links are orange on the map."""
+    """Draw the warnings about suspicious links, which are orange on the map."""
     for finding in desk.findings:
         ui.label(finding).classes("warning").props("role=note")
 
@@ -226,12 +231,12 @@ def _assumptions(desk: Desk) -> None:
     with ui.row():
         ui.button("Save changes", on_click=desk.save)
         ui.button("Draft again", on_click=again).props("outline").tooltip(
-            "Keeps this study under another name"
+            "This study is kept under another name"
         )
 
 
 def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
-    """Draw a control for a value of the study, and return a function that reads it."""
+    """Draw a control for a value of the study, and return a function that reads the control."""
     if isinstance(value, bool):
         switch = ui.switch(key, value=value)
         return lambda: switch.value
@@ -272,7 +277,7 @@ def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
 
 
 def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]:
-    """The tables that most likely contain the links and their transmitters, judged by columns, then by names.
+    """The tables that most likely contain the links and the transmitters, judged first by columns and then by names.
 
     The second name is empty if no table looks like a table of transmitters.
     """
@@ -290,12 +295,12 @@ def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]
 
 
 SITES: Final = ("cell", "site", "mast", "access", "transmitter", "station")
-"""Words in the file names of tables of transmitters."""
+"""Words that occur in the file names of transmitter tables."""
 
 
 @lru_cache(maxsize=100)
 def _content(file: Path, changed: int) -> str:
-    """The content of a table, judged by its columns: "links" or "transmitters"; empty if neither is recognized.
+    """The content of a table, judged by its columns: "links" or "transmitters"; empty if the columns show neither.
 
     `changed` is the file's modification time, so that a modified file is read again.
     """
@@ -320,7 +325,7 @@ def show_parameters(desk: Desk) -> None:
     if not isinstance(parameters, dict):
         missing = "Draft the study first."
         if desk.folder.study_file.is_file():
-            missing = f"{STUDY} has an error, shown under Measurements. Correct it in a text editor."
+            missing = f"{STUDY} has an error, which is shown under Measurements. Correct the error in a text editor."
         ui.label(missing).classes("quiet")
         return
     edits = {name: _entry(name, entry) for name, entry in parameters.items()}
@@ -334,11 +339,11 @@ def show_parameters(desk: Desk) -> None:
 
 
 def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
-    """Draw the controls of a parameter; return a function that reads its entry, or None if it is not calibrated."""
+    """Draw the controls of a parameter; return a function that reads its entry (None if not calibrated)."""
     low, high = map(float, entry["bounds"])
     prior = entry.get("prior", {})
     stated = prior.get("itu", "")
-    # The study may state a revision or a material that is not in the list ("concrete@P.2040-1").
+    # The study may state a revision or a material that is not in the list, such as "concrete@P.2040-1".
     materials = list(dict.fromkeys(["", stated, *ITU]))
     with ui.element("fieldset"):
         with ui.element("legend"):
@@ -382,5 +387,5 @@ def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | No
 
 
 def safe(name: str) -> str:
-    """A name without quotes, because a quote would end a property string."""
+    """The name without quotes, because a quote would end a property string."""
     return "".join(letter for letter in name if letter.isalnum() or letter in " ._-")

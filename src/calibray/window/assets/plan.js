@@ -5,7 +5,7 @@ const plan = (() => {
   let centre = [0, 0], zoom = 1, point = null, area = null, suggested = [], drawing = false, grip = null, moved = false, whole = true;
   let width = 1, height = 1, queued = false;
   const pointers = new Map(); // position of each finger, or of the mouse while its button is down
-  let layer = null; // cached image of what does not change while the map is dragged: twice the map's size, with centre and zoom
+  let layer = null; // cached image of the content that stays the same while the map is dragged: twice the map's size, with centre and zoom
 
   const color = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
   const toScreen = (x, y) => [width / 2 + (x - centre[0]) * zoom, height / 2 - (y - centre[1]) * zoom];
