@@ -94,9 +94,9 @@ class Comparison:
         """One row per method: the excess after given numbers of RT calls, and the RT calls to reach given excesses.
 
         The table contains the median, the quartiles and the worst excess after 30, 60 and 225 RT calls and at the end.
-        For each given excess, the table contains the number of runs that reached this excess and the median number of
-        RT calls that they needed. The median is empty if at least half of the runs did not reach the excess. Further
-        columns contain the number of failed runs and the median duration of a run [s].
+        For each given excess, the table contains the number of runs that reached it and the median number of RT calls
+        needed. The median is empty if at least half of the runs did not reach the excess. Further columns contain the
+        number of failed runs and the median duration of a run [s].
         """
         return pd.DataFrame([self._row(method) for method in self.methods])
 
@@ -292,7 +292,7 @@ def compare(
         announce: Called before the first run with a text that states the number of runs and of RT calls.
 
     Raises:
-        InputError: A method, the number of seeds or workers, or the folder is invalid.
+        InputError: A method, the number of seeds, the number of workers, or the folder is invalid.
         EngineError: A worker process died, or no evaluation of any run succeeded.
     """
     for name, value in (("seeds", seeds), ("workers", workers)):

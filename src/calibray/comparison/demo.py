@@ -1,7 +1,8 @@
 """The paper's experiment, which calibrates the demo district with GWO, SGWO-IM, space mapping and `auto`.
 
 Space mapping runs on the engine "retrace", which traces the scene again for every candidate and so represents engines
-without stored paths. Its cheap model replays a trace with fewer interactions per path. `auto` runs on stored paths.
+without stored paths. The cheap model of space mapping replays a trace with fewer interactions per path. `auto` runs on
+stored paths.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ FILES: Final = (RECORD, *FIGURES, page.FILE)
 """Files of the experiment, in addition to a folder for each method."""
 
 MAPPING_CALLS: Final = 8
-"""Number of RT calls of space mapping; each RT call is a trace."""
+"""Number of RT calls of space mapping; each RT call traces the scene."""
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:

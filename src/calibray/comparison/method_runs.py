@@ -117,7 +117,7 @@ class BudgetedMethod:
     """A method with its budget.
 
     Attributes:
-        name: Name of the method in tables, as requested.
+        name: Name of the method in tables, as requested by the user.
         method: Name of the method in `METHODS`.
         budget: Maximum number of RT calls.
     """
@@ -181,7 +181,7 @@ class BudgetedMethod:
         )
 
     def run(self, problem: ComparisonProblem, seed: int) -> MethodRun:
-        """Run the method; if an error ends the run, its message is recorded."""
+        """Run the method; if an error ends the run, the error message is recorded."""
         return run_optimizer(problem, self.key(seed), lambda: self.optimizer(problem, seed))
 
 
@@ -223,7 +223,7 @@ class MethodRun:
 
 
 def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Optimizer]) -> MethodRun:
-    """Run an optimizer to its end; if an error ends it, the message is recorded."""
+    """Run an optimizer to its end; if an error ends the run, the error message is recorded."""
     calls: list[int] = []
     best: list[float] = []
     evaluations, failure, started = 0, "", time.perf_counter()

@@ -188,7 +188,7 @@ class ProblemRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The ceiling if there is one, otherwise the measured path loss [L], [dB]."""
+        """The path loss ceiling or, if there is no ceiling, the measured path loss [L], [dB]."""
         objective = self.problem.objective
         if objective.ceiling_db is not None:
             return np.full(len(objective.measured), objective.ceiling_db)
@@ -239,7 +239,7 @@ class CheapReplay:
 def make_cheap_replay(
     problem: Problem, progress: Progress | None = None, scene: Setup | None = None
 ) -> CheapReplay:
-    """Trace a problem's scene for a cheap model if its method uses one; report the reason if this fails.
+    """Trace a problem's scene for a cheap model if the method uses such a model; if tracing fails, report the reason.
 
     If `scene`, another study of the same links, is given, its scene is traced instead. The stage of `progress` is
     "tracing".

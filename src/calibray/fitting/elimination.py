@@ -12,8 +12,8 @@ Block principal pivoting (L. F. Portugal, J. J. Judice and L. N. Vicente, A comp
 interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of Computation 63,
 1994) enforces the bounds in all problems of a batch simultaneously. Each iteration fixes components outside their
 bounds at the bound, releases the fixed components whose gradient points inwards, and solves again. If the number of
-infeasible components stops decreasing, only the last of them is exchanged (Murty's rule), which guarantees termination.
-The result meets the optimality conditions exactly, without a step length or a convergence tolerance.
+infeasible components stops decreasing, only the last infeasible component is exchanged (Murty's rule), which guarantees
+termination. The result meets the optimality conditions exactly, without a step length or a convergence tolerance.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class Elimination:
         order: Index in the design of each column of `normal` [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
-        separable: Whether each link has an entry in at most one column.
-        determined: Mask of the columns that the links determine [q]. Among linearly dependent columns, those of the
-            finest grouping count as determined.
+        separable: Whether every link has an entry in at most one column.
+        determined: Mask of the columns that the links determine [q]. Among linearly dependent columns, the columns of
+            the finest grouping count as determined.
     """
 
     design: Matrix
@@ -113,8 +113,8 @@ class Elimination:
         """The best coefficients [n, q], [dB] per unit of the column.
 
         The gap is measured minus modelled path loss at the links with nonzero weight [n, m], [dB]. An undetermined
-        coefficient has the value nearest to 0 within its bounds, unless the bounds prevent the other coefficients from
-        reaching the minimum.
+        coefficient takes the value nearest to 0 within its bounds, unless other coefficients then cannot reach the
+        minimum within their bounds.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -141,8 +141,8 @@ class Elimination:
     ) -> NDArray[np.float64]:
         """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for components at a bound.
 
-        They are the negative derivatives of the best coefficients [n, q] with respect to the parameters. `slope`
-        contains the derivatives of the modelled path loss at the links with nonzero weight [n, m, d].
+        These coefficients are the negative derivatives of the best coefficients [n, q] with respect to the parameters.
+        `slope` contains the derivatives of the modelled path loss at the links with nonzero weight [n, m, d].
         """
         if isinstance(self.weighted, np.ndarray):
             side = self.weighted @ slope
@@ -179,8 +179,8 @@ class Arrowhead:
         border: Products of the block columns with the p border columns [g, b, p].
         corner: Products of the border columns with each other [p, p].
         dependent: Mask of the components whose column is zero or a linear combination of the preceding columns [q]; the
-            blocks precede the border. The matrix includes a small prior on these components. They are therefore zero
-            unless the bounds prevent the other components from reaching the minimum.
+            blocks precede the border. The matrix includes a small prior on these components. These components are
+            therefore zero unless the bounds prevent the other components from reaching the minimum.
     """
 
     scale: NDArray[np.float64]
@@ -270,7 +270,7 @@ class Arrowhead:
     def _trial(
         self, side: NDArray[np.float64], free: NDArray[np.bool_], value: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Minimum over the free components with the others fixed at their values [m, q]."""
+        """Minimum over the free components, with the other components fixed at their values [m, q]."""
         rest = np.where(free, side - self._times(np.where(free, 0.0, value)), 0.0)
         if (free == free[0]).all():
             return self._solve(free[:1], rest.T[None])[0].T

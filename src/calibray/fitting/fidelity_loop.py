@@ -19,9 +19,9 @@ from calibray.study.displacement import displaces
 from calibray.support.progress import Progress, with_stage
 
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
-"""Traced displacements on each side of a calibrated position, as fractions of the largest displacement. For a largest
-displacement of 8 m, they are 0.5 to 8 m. The five inner positions are equidistant, so that the interpolation error can
-be estimated."""
+"""Traced displacements on each side of a calibrated position, as fractions of the largest displacement. If the largest
+displacement is 8 m, the traced displacements are 0.5 to 8 m. The five inner positions are equidistant, so that the
+interpolation error can be estimated."""
 
 
 def retrace(
@@ -30,9 +30,9 @@ def retrace(
     """Trace with the calibrated materials, and calibrate again as long as path loss changes by more than the tolerance.
 
     The tracer samples refraction and diffuse reflection according to the materials, so the set of paths can depend on
-    them. Path loss at displaced antennas is interpolated. Without refraction, diffuse reflection or displacements, the
-    paths are not traced again. Only the method `auto` calibrates again; other methods have a fixed budget of RT calls.
-    The stage of `progress` is "checking".
+    the materials. Path loss at displaced antennas is interpolated. Without refraction, diffuse reflection or
+    displacements, the paths are not traced again. Only the method `auto` calibrates again; other methods have a fixed
+    budget of RT calls. The stage of `progress` is "checking".
 
     Returns:
         The problem of the last calibration, its search, and the gap of every link [L], [dB]: path loss on paths traced
@@ -45,7 +45,8 @@ def retrace(
     displaced = any(displaces(name) for name in parameters.names)
     rounds = study.fidelity.rounds
     if rounds is None:
-        # A height that is wrong by 5 m is corrected in 2 traces, five wrong positions in 2 to 4.
+        # A height that is wrong by 5 m is corrected in 2 traces, and five wrong positions are corrected in 2 to 4
+        # traces.
         rounds = 4 if displaced else 3
     if not isinstance(section, ReplaySection) or section.rays or rounds == 0 or not (sampled or displaced):
         return problem, trail, None
@@ -93,12 +94,12 @@ def with_interpolation_error(
     """The objective with weights that account for the interpolation errors of the links' path loss [L], [dB].
 
     Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is the
-    standard deviation of the interpolation error, in addition to a link's other errors. It is infinite for links that
-    are left out. The other errors are estimated from the residuals at the modelled path loss [L], [dB].
+    standard deviation of the interpolation error, in addition to a link's other errors. `error_db` is infinite for
+    links that are left out. The other errors are estimated from the residuals at the modelled path loss [L], [dB].
     """
     counted = (objective.weight > 0) & np.isfinite(error_db)
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
-    # Relative to the mean weight; the median is robust against links with large interpolation errors.
+    # Weights are relative to the mean weight, and the median is robust against links with large interpolation errors.
     relative = objective.weight[counted] / objective.weight[counted].mean()
     variance = np.median(residual**2 * relative) / chdtri(1, 0.5) / relative
     weight = objective.weight.copy()
@@ -109,7 +110,7 @@ def with_interpolation_error(
 
 
 def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change of path loss [L], [dB]; 0 if neither trace has a path for the link, infinite if only one has."""
+    """Change in path loss [L], [dB]; 0 if neither trace has a path for the link, infinite if one trace has."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
 

@@ -27,8 +27,8 @@ CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
 
 UNKNOWN_DB: Final = 10.0
-"""Assumed standard deviation between groups if only one group is measured [dB per unit of the column]. It is large
-because a single group contains no information about the spread."""
+"""Assumed standard deviation between groups if only one group is measured [dB per unit of the column]. This value is
+large because a single group contains no information about the spread."""
 
 START_SPREAD: Final = 6.0
 """Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
@@ -55,7 +55,7 @@ class Term:
             flat.
         centre: Value subtracted from the column: for "log_distance", the mean of log10(distance / 1 m) over the links
             for which the term was made; otherwise 0.
-        around: For the deviations of a random effect, the name of the term that holds their mean; otherwise "".
+        around: For the deviations of a random effect, the name of the term that contains the mean; otherwise "".
     """
 
     name: str
@@ -70,7 +70,7 @@ class Term:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the term's columns: its own name, with the group in brackets if there are groups."""
+        """Names of the term's columns: the name of the term, followed by the group in brackets if there are groups."""
         return tuple(f"{self.name}[{label}]" if label else self.name for label in self.labels)
 
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
@@ -88,7 +88,7 @@ class Term:
         if labels is None:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
         link_labels = _labels(self.name, links, labels)
-        # The labels are sorted, so the index of an unknown label is that of a neighbour with a different label.
+        # The labels are sorted, so the index of an unknown label points to a neighbouring label, which differs.
         index = np.minimum(np.searchsorted(self.labels, link_labels), len(self.labels) - 1)
         matches = np.array(self.labels)[index] == link_labels
         return replace(self, value=value, group=np.where(matches, index, -1))
@@ -157,7 +157,7 @@ def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) ->
 
 
 def deviations_of(name: str) -> str:
-    """Name of the term that holds the deviations of a random effect's groups from their mean."""
+    """Name of the term that contains the deviations of a random effect's groups from the mean."""
     return f"{name}, deviation"
 
 
@@ -170,7 +170,7 @@ def column(links: Measurements, by: str) -> NDArray[np.float64]:
     """The column of a term [L], before it is centred; see `make_term`.
 
     Raises:
-        InputError: The links' table lacks the column, or it is not numeric.
+        InputError: The links' table lacks the column, or the column is not numeric.
     """
     if by == CONSTANT:
         return np.ones(len(links))
@@ -192,7 +192,7 @@ class Nuisance:
 
     Attributes:
         num_links: Number of links L.
-        terms: Terms of the design; may be empty.
+        terms: Terms of the design; the tuple may be empty.
 
     Raises:
         InputError: A term has a different number of links, or two terms have the same name.
@@ -228,7 +228,7 @@ class Nuisance:
 
     @cached_property
     def prior(self) -> NDArray[np.float64]:
-        """Standard deviations of the priors [q], [dB] per unit of the column; +inf where flat."""
+        """Standard deviations of the priors [q], [dB] per unit of the column; +inf for flat priors."""
         return self._per_column([term.prior for term in self.terms])
 
     @cached_property
@@ -249,8 +249,8 @@ class Nuisance:
         Columns of different groups share no link, so the groups of one grouping form diagonal blocks.
 
         Returns:
-            Order of the columns [q] with those of the finest grouping first, group by group; the number of its groups;
-            and the number of its terms.
+            The order of the columns [q], with the columns of the finest grouping first, group by group; and the numbers
+            of groups and of terms of the finest grouping.
         """
         first = np.cumsum([0, *(len(term.labels) for term in self.terms)])
         by_grouping: dict[bytes, list[int]] = {}
@@ -268,7 +268,7 @@ class Nuisance:
         return (self.design @ coefficients.T).T
 
     def filled(self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Coefficients [n, q]; undetermined ones are replaced by the mean of the determined ones of their term.
+        """Coefficients [n, q]; each undetermined coefficient is replaced with the mean of its term's determined ones.
 
         Undetermined deviations of a random effect keep their value of 0. `determined` is the mask of the determined
         coefficients [q].

@@ -6,7 +6,7 @@ coefficients follow in closed form (variable projection), so optimizers search o
 
 A Gaussian prior on a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
 of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows; `rmse` is
-the paper's RMSE over the links only. Without priors, the two are equal.
+the paper's RMSE over the links only. Without priors, `value` and `rmse` are equal.
 
 For many links, the objective is summed over chunks of links. For gaps g (measured minus modelled path loss),
 derivatives J, weights w and a nuisance's design Z, a chunk returns [J g]' w [J g] and Z' w [J g]. The sums of these
@@ -55,9 +55,9 @@ class Share:
     """The objective's data for one chunk of links; calling it with the path loss of these links returns their sums.
 
     Attributes:
-        links: Indices within the chunk of its m links with nonzero weight [m].
+        links: Indices, within the chunk, of the m links with nonzero weight [m].
         measured: Their measured path loss [m], [dB].
-        weight: Their weights, normalised as in the objective [m].
+        weight: Weights of these links, normalised as in the objective [m].
         design: The c columns of the nuisance with entries at these links [m, c].
         columns: Indices of these columns in the nuisance [c].
         ceiling_db: Path loss assigned to a link without a path [dB]; None if there is no ceiling.
@@ -120,8 +120,8 @@ class Objective:
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The best coefficients of the nuisance [n, q], [dB] per unit of their columns, for path loss [n, L], [dB].
 
-        Links without a path for a candidate are left out of its fit. A coefficient that is not `determined` takes the
-        value nearest to 0 within its bounds.
+        Links without a path for a candidate are left out of the candidate's fit. A coefficient that is not `determined`
+        takes the value nearest to 0 within its bounds.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -188,7 +188,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients that the links determine, each weighted by the links' share of its precision.
+        """Number of coefficients determined by the links, each weighted by the links' share of its precision.
 
         Coefficients whose priors keep them at zero explain no residuals, regardless of the number of groups.
         """
@@ -214,8 +214,8 @@ class Objective:
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """Residuals [n, links with weight + priors], [dB], whose root mean square is `value`, for path loss [n, L].
 
-        They are (model - measurement) times the square root of the weights, followed by one row per coefficient with a
-        prior.
+        The residuals are (model - measurement) times the square root of the weights, followed by one row per
+        coefficient with a prior.
         """
         coefficients = self.coefficients(path_loss)
         links = (self._model(path_loss, coefficients) - self.measured)[:, self._counted] * self._scale
@@ -224,7 +224,7 @@ class Objective:
     def jacobian(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, links with weight + priors, d], from those of path loss [n, L, d]."""
+        """Derivatives of the residuals [n, links with weight + priors, d], from derivatives of path loss [n, L, d]."""
         slope, prior_rows = self._slopes(path_loss, derivative), None
         if self.nuisance.terms:
             projection = self._elimination.projection(slope, self.coefficients(path_loss))
@@ -239,7 +239,7 @@ class Objective:
     def value(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """The minimised value [n], [dB]: the root mean square of all residuals, including the rows of priors.
 
-        It equals the RMSE if no coefficient has a prior. It is +inf if a link with nonzero weight has no path.
+        The value equals the RMSE if no coefficient has a prior, and is +inf if a link with nonzero weight has no path.
         """
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 

@@ -42,8 +42,8 @@ class Observed:
         statistic: The modelled quantity.
         measured: Measured values [L], in the study's unit; NaN for a link without a value.
         scale: Size of the study's unit in SI units.
-        group: Index of the group of each link's bias [L]; -1 without a bias.
-        labels: Labels of the groups; empty without a bias.
+        group: Index of the group of each link's bias [L]; -1 if there is no bias.
+        labels: Labels of the groups; empty if there is no bias.
         std: Standard deviation of a value's error, in the study's unit.
         stated: Whether the study states `std`.
     """
@@ -84,7 +84,7 @@ class Observed:
         return np.where(found, gap - bias[:, self.group[used]], 0.0), -bias
 
     def slopes(self, derivative: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, m, k], from those of the modelled values [n, L, k].
+        """Derivatives of the residuals [n, m, k], from derivatives of the modelled values [n, L, k].
 
         The derivatives of a link without a statistic are NaN.
         """

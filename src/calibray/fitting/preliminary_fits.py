@@ -53,27 +53,27 @@ SELECTIONS: Final = 4
 """Maximum number of selections."""
 
 NOISE_ESTIMATES: Final = 5
-"""Maximum number of noise estimates; each estimate weights the priors by the previous one."""
+"""Maximum number of noise estimates; each estimate weights the priors by the previous estimate."""
 
 TOLERANCE: Final = 0.02
 """Relative change of the estimates at which the iteration ends."""
 
 LEAST_NOISE_DB: Final = 1e-3
-"""Lower limit of the noise estimate [dB]; it keeps the weight of the priors above zero for data without noise."""
+"""Lower limit of the noise estimate [dB], which keeps the weight of the priors above zero for data without noise."""
 
 LEAST_SPREAD_DB: Final = 0.05
-"""Lower limit of the spread between groups [dB per unit of the column]; it keeps the weight of the prior finite."""
+"""Lower limit of the spread between groups [dB per unit of the column], which keeps the weight of the prior finite."""
 
 SEARCHES: Final = 32
-"""Number of local searches of the first fit; later fits continue from its minima."""
+"""Number of local searches of the first fit; later fits continue from the minima of the first fit."""
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
     """Give links with a predicted power near the noise floor a weight of 0, and mark them in `faint`.
 
-    The problem is unchanged if there is no noise floor. It is also unchanged on an engine without derivatives, because
-    its calls are expensive. If the remaining links determine fewer unknowns, the problem is unchanged and a warning is
-    logged. The stage of `progress` is "choosing links".
+    The problem is unchanged if there is no noise floor. The problem is also unchanged for an engine without
+    derivatives, whose calls are expensive. If the remaining links determine fewer unknowns, the problem is unchanged
+    and a warning is logged. The stage of `progress` is "choosing links".
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
     if limit is None or not problem.differentiable:
@@ -134,8 +134,8 @@ def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_
     lost = np.flatnonzero(problem.objective.determined & ~determined)
     names = ", ".join(problem.objective.nuisance.columns[column] for column in lost[:MAX_LISTED])
     _LOG.warning(
-        "%s: %s of %s links are expected near the noise floor, but are kept because the others do not determine %s; "
-        "weak links are received only if fading is favourable, so the fitted offsets and path loss are too low; "
+        "%s: %s of %s links are expected near the noise floor, but are kept because the other links do not determine "
+        "%s; weak links are received only if fading is favourable, so the fitted offsets and path loss are too low; "
         "measure at shorter distances",
         problem.setup.links.source, f"{faint.sum():,}", f"{problem.objective.num_counted:,}",
         names or "all unknowns",
@@ -241,7 +241,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
-    """The problem with errors of the further observables that are estimated at a point of the search space [d]."""
+    """The problem with estimates of the further observables' errors, from the residuals at a point [d]."""
     if not problem.observed:
         return problem
     candidate = problem.parameters.from_search(point[None])
@@ -265,7 +265,7 @@ class GroupSpread(NamedTuple):
 
     Attributes:
         between: Standard deviation between groups, in the unit of the residuals per unit of the column; 0 if the groups
-            do not differ, and `UNKNOWN_DB` if the links do not determine it.
+            do not differ, and `UNKNOWN_DB` if the links do not determine this standard deviation.
         within: Standard deviation of individual links within a group, in the unit of the residuals.
     """
 
@@ -327,11 +327,11 @@ ROUNDS: Final = 20
 """Maximum number of estimates; three suffice if the links determine the values of most transmitters well."""
 
 LEAST: Final = 1e-3
-"""Lower limit of a spread, as a fraction of the width of the bounds; it keeps the weights of the priors finite."""
+"""Lower limit of a spread, as a fraction of the width of the bounds, which keeps the weights of the priors finite."""
 
 
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Estimate the spread of every population of transmitters for which the study states none.
+    """Estimate the spread of every population of transmitters for which the study states no spread.
 
     The study and the priors of the returned problem contain the spreads. The stage of `progress` is "estimating
     spreads".

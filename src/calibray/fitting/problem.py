@@ -102,7 +102,7 @@ class Problem:
 
     @classmethod
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:
-        """Set up a study's problem. This runs the engine once, for the initial parameters.
+        """Set up a study's problem. This method runs the engine once, for the initial parameters.
 
         Raises:
             InputError: No calibration link is left, or a group has only held-out links.
@@ -202,7 +202,7 @@ class Problem:
     def respond(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Responses:
         """The engine's response to candidates in physical units [n, d]: the links' values and further observables.
 
-        If derivatives are requested, the engine must provide them with respect to the parameters.
+        If derivatives are requested, the engine must provide derivatives with respect to the parameters.
         """
         if self.observed:
             return self._observing.respond(candidates, self.statistics, derivatives)
@@ -217,7 +217,7 @@ class Problem:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
 
         If the engine divides the links into chunks, each chunk returns sums, and d + 1 compressed residuals represent
-        those of all links. With any other engine, the residuals are not compressed.
+        the residuals of all links. With any other engine, the residuals are not compressed.
         """
         if self._chunks is None:
             return self.evaluate(points, derivatives)
@@ -283,7 +283,7 @@ class Problem:
     ) -> NDArray[np.float64]:
         """Weighted residuals [n, m] of modelled values [n, L], followed by those of priors and further observables.
 
-        Candidates [n, d] are in physical units, and further observables [n, K, L] in SI units.
+        Candidates [n, d] are in physical units, and further observables [n, K, L] are in SI units.
         """
         parts = [self.objective.residuals(modelled)]
         if len(self.priors):
@@ -301,7 +301,7 @@ class Problem:
     ) -> NDArray[np.float64]:
         """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any others.
 
-        They are computed from the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
+        The inputs are the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """
         parts = [self.objective.jacobian(modelled, slope)]
         if len(self.priors):

@@ -45,7 +45,7 @@ TRIALS: Final = 300
 misfits."""
 
 TRIED_PATHS: Final = 500_000
-"""Maximum product of the number of trials and the number of paths; it limits the time spent on basin hopping."""
+"""Maximum product of the number of trials and the number of paths, which limits the time spent on basin hopping."""
 
 PROMISING: Final = 3.0
 """A trial is refined further if its misfit is less than this multiple of the largest misfit among the explanations that
@@ -84,7 +84,7 @@ class Ratio(NamedTuple):
 
     Attributes:
         call: The earlier call.
-        here: Indices of the paths in the last call, ascending [n].
+        here: Indices of the paths in the last call, in ascending order [n].
         weight: Weights of the paths [n]; the sum over all ratios is 1.
         level_db: Power in the last call [n], [dB].
         observed: Power in the last call relative to the power in the earlier call [n], [dB].
@@ -153,7 +153,7 @@ def half_spaces(fit: Understanding, calls: list[Call]) -> tuple[str, ...]:
 def _search(
     first: Understanding, ratios: list[Ratio], last: Call, before: Understanding | None
 ) -> Understanding:
-    """Add the materials one at a time, then scan all of them again."""
+    """Add the materials one at a time, and then scan all materials again."""
     meets, order = _meetings(first.model)
     fits, done = [first, *_with_the_constants_of(first, ratios, last)], np.zeros(meets.shape[1], dtype=bool)
     for material in order:

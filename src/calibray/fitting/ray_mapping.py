@@ -56,8 +56,8 @@ objective and in RMS path loss [dB]."""
 
 GAP_DB: Final = 0.2
 """An optimum counts as reached only if the gap at the last call is at most this large [dB]. After six calls, the excess
-RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB. It was 0.020 to 0.15 dB in eight runs with gaps
-above 0.36 dB."""
+RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB. The excess RMSE was 0.020 to 0.15 dB in eight runs
+with gaps above 0.36 dB."""
 
 MISFIT_DB: Final = 0.2
 """An engine counts as understood only if the misfit of its ratios is at most this large [dB]. With misfits of 0.07 to
@@ -69,8 +69,8 @@ loss by more than this [dB]. Paths that appear between calls may be missing at t
 
 SEARCHES: Final = 4
 """Number of local searches, as a multiple of the number in a calibration by replay; one call costs more than many
-searches. In a district with 557 interactions, 512 and 1,024 searches with two of five seeds missed a minimum that is
-0.076 dB lower; 2,048 searches found it with all five."""
+searches. In a district with 557 interactions, 512 and 1,024 searches missed a minimum that is 0.076 dB lower for two of
+five seeds; 2,048 searches found this minimum for all five seeds."""
 
 LEAST_CALLS: Final = 3
 """Minimum number of calls in ray mapping: two to identify the assumptions, and one at the minimum."""
@@ -128,7 +128,7 @@ class RayMap:
         """Whether the optimum is reached, the model explains all calls, and the calls share their strong paths.
 
         The replay then represents the engine at other candidates as well. Ratios of paths without a calibrated material
-        are 1 with any model, so they explain nothing.
+        are 1 with any model, so these ratios explain nothing.
         """
         model = self.understanding.model
         explained = model.meets_calibrated and self.understanding.misfit_db <= MISFIT_DB
@@ -237,7 +237,7 @@ def map_rays(
 def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64], calls: int) -> LeastSquares:
     """Search the replay from given points [k, d] and from many random points, which differ after each call.
 
-    A search can miss the lowest minimum. The next search starts from different points and can then find it.
+    A search can miss the lowest minimum. The next search starts from different points and can then find this minimum.
     """
     searches = SEARCHES * local_searches(replay.interactions)
     return least_squares(with_engine(problem, replay), searches, starts, seed=calls)

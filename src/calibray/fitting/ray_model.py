@@ -38,7 +38,8 @@ from calibray.paths import Paths
 from calibray.tracing.antennas import wave_basis
 
 HALF_SPACE: Final = 1e4
-"""Thickness that represents a half-space [m]: a wave decays within it unless the conductivity is below 1e-6 S/m."""
+"""Thickness that represents a half-space [m]: a wave decays within this thickness unless the conductivity is below 1e-6
+S/m."""
 
 DECAYED: Final = 4.0
 """Attenuation in a slab [Np] above which the slab acts as a half-space: the wave returns with e^-8 of its amplitude."""
@@ -50,8 +51,8 @@ PERMITTIVITY_FACTOR: Final = 2.0
 """Maximum factor between the study's value and the engine's value of a permittivity that is not calibrated."""
 
 TILT: Final = 0.3
-"""Maximum tangent of the tilt of an antenna's axis along x or y. It corresponds to 17 degrees, which exceeds the tilt
-of base stations."""
+"""Maximum tangent of the tilt of an antenna's axis along x or y. This value corresponds to 17 degrees, which exceeds
+the tilt of base stations."""
 
 ANGLES: Final = 3
 """Number of angles of the antenna at each end: the slant and two tilts."""
@@ -282,7 +283,8 @@ class Polarized:
 def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
     """Unit vector theta of antennas with axes [..., 3], as components [..., P, 2] along the field vectors [P, 2, 3].
 
-    It points away from the pole: it is the component of -axis orthogonal to the direction, scaled to unit length.
+    The vector theta points away from the pole: it is the component of -axis orthogonal to the direction, scaled to unit
+        length.
     """
     theta = -xp.einsum("pac,...c->...pa", basis, axis)
     return theta / xp.sqrt(xp.maximum(xp.sum(theta**2, axis=-1, keepdims=True), 1e-12))

@@ -2,8 +2,8 @@
 
 A slab resonates: the power of a ray varies periodically with the thickness, and the period is half a wavelength. A
 local search can therefore end in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the
-wave has decayed. It does so for several conductivities and several polarizations at both ends. A scan uses only paths
-that consist of reflections and transmissions.
+wave has decayed. The grid is evaluated for several conductivities and for several polarizations at both ends. A scan
+uses only paths that consist of reflections and transmissions.
 
 An antenna receives almost no power from a direction in which the wave is orthogonal to its polarization. Every path
 near such a null adds a minimum of the misfit. These minima are about 0.02 rad apart, so a local search from upright

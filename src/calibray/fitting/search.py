@@ -32,8 +32,8 @@ STARTS: Final = (16, 512)
 """Minimum and maximum number of local searches in a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
-"""Target for the number of local searches times the number of interactions of the path program. It keeps the time of a
-search similar for small and large programs."""
+"""Target for the number of local searches times the number of interactions of the path program. This target keeps the
+time of a search similar for small and large programs."""
 
 
 def check_method(name: str) -> None:
@@ -116,8 +116,8 @@ BASINS: Final = 24
 """Maximum number of known minima that are used as starting points for a changed problem."""
 
 RELEVANT: Final = 20.0
-"""Maximum excess of the sum of squares at a relevant minimum over the sum at the lowest minimum, in noise variances. It
-corresponds to a likelihood ratio of e^-10."""
+"""Maximum excess of the sum of squares at a relevant minimum over the sum at the lowest minimum, in noise variances.
+This excess corresponds to a likelihood ratio of e^-10."""
 
 
 def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
@@ -186,7 +186,7 @@ class Trail:
     def add(
         self, candidates: NDArray[np.float64], evaluation: Evaluation, iteration: int, seconds: float
     ) -> None:
-        """Record a round: candidates in physical units [n, d], its number from 1, and time since the start [s]."""
+        """Record round `iteration`: candidates in physical units [n, d] and the time since the start [s]."""
         self.candidates += list(candidates)
         self.rmse_db += evaluation.rmse_db.tolist()
         self.iteration += [iteration] * len(evaluation.value)
@@ -237,7 +237,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
             stage = f"calibrating: best RMSE {trail.best_rmse_db:.2f} dB"
             progress(stage, len(trail.rmse_db), optimizer.budget)
     trail.ledger_hits = _hits(engine) - hits
-    # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
+    # Calls from the ledger count as well, so that a restarted run reports the same cost as an uninterrupted run.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
     if not (problem.differentiable or problem.observed):
         # The engine was called for the initial values before the search, so these values are compared as well.

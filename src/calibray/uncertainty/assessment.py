@@ -48,7 +48,8 @@ LARGEST_ERROR: Final = 0.5
 """Intervals are drawn only if the emulator's leave-one-out error is at most this fraction of the best call's RMSE. With
 larger errors, candidates near a call fit better only because the emulator is exact at the calls. Without this limit,
 the intervals of parameters judged identified or weakly identified contained 2 of 7 true values for runs with 2 calls
-per parameter. For runs with 8 or 16 calls per parameter, they contained 14 of 14 (docs/measurements/intervals.md)."""
+per parameter. For runs with 8 or 16 calls per parameter, the intervals contained 14 of 14
+(docs/measurements/intervals.md)."""
 
 NEGLIGIBLE_DB: Final = 0.05
 """An emulator error up to this value is always accepted [dB]; path loss is not measured more precisely."""
@@ -166,7 +167,7 @@ def _assess_emulated(
 
 
 def _full_ranges(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
-    """Intervals over the whole range, with the standard deviation of a uniform distribution."""
+    """Intervals that cover the whole range, with the standard deviation of a uniform distribution."""
     return {
         parameter.name: Interval(
             (parameter.upper - parameter.lower) / np.sqrt(12.0),
@@ -388,11 +389,11 @@ def _effective(weight: NDArray[np.float64]) -> float:
 
 REPEAT_M: Final = 0.01
 """Maximum distance between the link ends of two rows that count as repeats of one link [m]; antennas are larger than
-this."""
+this distance."""
 
 REPEAT_DB: Final = 0.1
 """Maximum difference in modelled path loss between two rows that repeat a link [dB]; a different antenna or carrier
-frequency changes path loss by more than this."""
+frequency causes a larger change."""
 
 
 def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:

@@ -1,4 +1,4 @@
-"""Replay in which further constants vary: those of individual buildings, and those that the scene fixes.
+"""Replay in which further constants vary: constants of individual buildings, and constants fixed by the scene.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each
 combination of a building and a material becomes a separate material.
@@ -80,7 +80,7 @@ class Split(ABC):
     """A replay whose candidates set further constants in addition to the study's parameters.
 
     Attributes:
-        parameter_of: Index of the parameter to which each of c constants belongs, ascending [c].
+        parameter_of: Index of the parameter to which each of c constants belongs, in ascending order [c].
         building_of: Index of each constant's building; -1 for other objects, such as the ground [c].
         met: Indices of the buildings with which the paths interact.
         interactions: Number of interactions that are evaluated per candidate.

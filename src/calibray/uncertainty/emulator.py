@@ -55,7 +55,7 @@ class MeanFunction(Protocol):
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """Path loss, its derivatives [k, m, d], the inputs, and the derivatives of their responses [k, r, d]."""
+        """Path loss, its derivatives [k, m, d], the inputs, and the derivatives of the inputs' responses [k, r, d]."""
         ...
 
 
@@ -319,7 +319,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with path loss for every link with nonzero weight; beyond `MAX_CALLS` calls, a selection of them."""
+    """The calls with path loss for every link with nonzero weight; if there are too many calls, a selection."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)
@@ -344,7 +344,7 @@ def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Call
         for index in order.tolist():
             if not distinct or np.abs(unit[distinct] - unit[index]).max(axis=1).min() > NEAR:
                 distinct.append(index)
-        # Keep the best calls and an evenly spaced selection of the others.
+        # Keep the best calls and an evenly spaced selection of the other calls.
         half = MAX_CALLS // 2
         best, others = np.array(distinct[:half], dtype=np.int64), np.array(distinct[half:], dtype=np.int64)
         if len(others):

@@ -1,9 +1,9 @@
 """The joint model of all unknowns: parameters, fixed constants, buildings and errors.
 
 - The study's parameters have flat priors over their bounds, or the priors that the study declares.
-- Constants that the scene fixes for the calibrated materials, such as thickness, are not known exactly. They have a
-  log-normal prior around the scene's value. A scattering coefficient of 0 is assumed to be exact with a probability of
-  one half.
+- Constants that the scene fixes for the calibrated materials, such as thickness, are not known exactly. Such constants
+  have a log-normal prior around the scene's value. A scattering coefficient of 0 is assumed to be exact with a
+  probability of one half.
 - A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
   between-building spread s is zero with probability `ALIKE`; otherwise it is exponentially distributed.
 - Errors follow one of several noise models (`noise_models.py`). The noise level, the nuisances and an undeclared offset
@@ -50,8 +50,8 @@ class QuadraticForms:
 
     Attributes:
         marginal: The density.
-        group: Group of each model; models of one group are evaluated together [models]. It is -1 for Student's t, -2
-            for gross errors, and otherwise the model's own index.
+        group: Group of each model; models of one group are evaluated together [models]. The group is -1 for Student's
+            t, -2 for gross errors, and otherwise the model's own index.
         square: For each Gaussian model, the matrix [m, m], constant and exponent of its quadratic form; None for other
             models. Empty if there are too many links or if any link is censored.
     """

@@ -93,7 +93,7 @@ class Lengths:
     """Lengths of moves, adapted to their acceptance rates.
 
     Attributes:
-        buildings: Length of a move of all buildings; 1 draws them independently of their current values.
+        buildings: Length of a move of all buildings; with 1, the draws are independent of the current values.
         points: Length of a move along a difference, relative to the optimum for a normal density.
     """
 

@@ -195,8 +195,7 @@ def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, .
         if stated.get(kind, False):
             continue
         weight = float(noise.get(kind, 0.0))
-        # The alternative to differing buildings is equal buildings; the alternative to other kinds of noise is Gaussian
-        # noise.
+        # Differing buildings compete with equal buildings; other kinds of noise compete with Gaussian noise.
         rival = 1.0 - weight if kind == DIFFERING else gaussian
         if weight > max(NOTABLE, LIKELY * (weight + rival)):
             values: dict[str, Value] = {"weight": weight, "gaussian_weight": gaussian}
@@ -286,7 +285,7 @@ class UndeclaredOffset(NamedTuple):
 def fit_undeclared_offset(
     problem: Problem, minima: NDArray[np.float64], square: float, freedom: int
 ) -> UndeclaredOffset:
-    """Fit an offset for all links if the study declares none, and test its significance.
+    """Fit an offset for all links if the study declares no offset, and test the significance of this offset.
 
     Args:
         problem: The problem.

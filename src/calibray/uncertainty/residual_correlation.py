@@ -75,7 +75,7 @@ class Correlation:
     independent: float
 
     def covariance(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Covariance of the errors of links [m, m], [dB^2], from their positions [m, k], [m]."""
+        """Covariance of the errors of links [m, m], [dB^2], from the positions of the links [m, k], [m]."""
         shared = np.exp(-cdist(position, position) / self.range_m)
         return self.shared_db**2 * shared + self.own_db**2 * np.eye(len(position))
 
@@ -222,9 +222,9 @@ def whitener(
     """Make the whitener of the errors of links with end positions [m, k], [m].
 
     The errors have been multiplied by `scale` [m], so that the uncorrelated part has the same variance for all links.
-    The correlated part has the fraction `share` of the variance, from 0 to below 1. Its covariance falls to 1/e at the
-    distance `range_m` [m]. For up to `exact` links, the covariance is factored exactly. If `neighbours` is None, the
-    neighbours are computed.
+    The correlated part has the fraction `share` of the variance, from 0 to below 1. The covariance of this part falls
+    to 1/e at the distance `range_m` [m]. For up to `exact` links, the covariance is factored exactly. If `neighbours`
+    is None, the neighbours are computed.
     """
     count = len(position)
     if count <= exact:

@@ -46,9 +46,9 @@ def assess_richer_paths(
 ) -> Certainty:
     """The uncertainty with richer paths, and a remark, if the measurements favour these paths; otherwise `assessed`.
 
-    Nothing is traced if `lacking` returns no settings. This is the case, for example, if the study states the noise, if
-    its `fidelity.rounds` is 0, or if no link is out of sight. The stages of `progress` are "tracing more paths",
-    "fitting more paths" and "drawing with more paths".
+    Nothing is traced if `lacking` returns no settings. There are no settings, for example, if the study states the
+    noise, if its `fidelity.rounds` is 0, or if no link is out of sight. The stages of `progress` are "tracing more
+    paths", "fitting more paths" and "drawing with more paths".
 
     Args:
         problem: The problem.

@@ -1,8 +1,8 @@
 """Verdicts from draws of the posterior: a credible interval, a verdict and a reason for every parameter.
 
-A credible set is the smallest set that contains a given fraction of the posterior. It has two pieces if two distant
-ranges fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B. W.
-Silverman, Density Estimation for Statistics and Data Analysis, 1986, section 5.2). The kernels are mirrored at the
+A credible set is the smallest set that contains a given fraction of the posterior. The set has two pieces if two
+distant ranges fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B.
+W. Silverman, Density Estimation for Statistics and Data Analysis, 1986, section 5.2). The kernels are mirrored at the
 bounds.
 
 If the posterior cannot be sampled, linear theory is used instead: intervals and covariances follow from the curvature

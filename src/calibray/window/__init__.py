@@ -1,4 +1,5 @@
 """The window: a local web page for a study's folder, for people who do not use a terminal.
 
-The page runs the commands of the command line as separate processes, and shows the files that they read and write.
+The page runs the commands of the command line as separate processes, and shows the files that these commands read and
+write.
 """

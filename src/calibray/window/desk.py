@@ -90,7 +90,7 @@ class StudyFolder:
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:
-        """Names of the folders that contain results; the most recent is last."""
+        """Names of the folders that contain results; the most recent result is last."""
         written = {
             file.parent.name: file.stat().st_mtime_ns
             for file in self.path.glob("*/result.json")
@@ -113,7 +113,7 @@ class StudyFolder:
             raise InputError(f"{file}: cannot be read ({shortened(str(error))})") from None
 
     def check_upload(self, name: str) -> Path:
-        """The path for an uploaded file; meshes are stored in `meshes`, where scenes expect them.
+        """The path for an uploaded file; meshes are stored in `meshes`, where scenes expect mesh files.
 
         Raises:
             InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
@@ -329,9 +329,9 @@ class Desk:
 def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     """The map of the study, or of a scene in the folder if there is no study.
 
-    The map contains `west`, `north` [m], `scale` [1/m] and `height` of the outlines, and the `sites`. It contains
-    `buildings` and `walls` as SVG path data. Each of the `links` has x, y [m], path loss [dB], and 1 if the link is
-    suspicious, otherwise 0. Each of the `transmitters` has x, y, z [m].
+    The map contains `west`, `north` [m], `scale` [1/m] and `height` of the outlines, and the `sites`. The map also
+    contains `buildings` and `walls` as SVG path data. Each of the `links` has x, y [m], path loss [dB], and 1 if the
+    link is suspicious, otherwise 0. Each of the `transmitters` has x, y, z [m].
 
     Raises:
         InputError: The scene or the links cannot be read.

@@ -1,8 +1,8 @@
 """Commands that were started in a study's folder, from the window or from a terminal.
 
-Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes it,
-`0001.log` contains its output, and `0001.exit` contains its exit status. A command without an exit status and without a
-process has died; if the command is started again, its work is resumed.
+Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes the
+command, `0001.log` contains the output, and `0001.exit` contains the exit status. A command without an exit status and
+without a process has died; if the command is started again, its work is resumed.
 
 `python -m calibray.window.jobs` runs one command in its own session, so that the command outlives the server, and
 records the exit status. Ctrl-C is passed to the command, which keeps finished work.
@@ -112,7 +112,7 @@ class Jobs:
         return Job(number, tuple(words), "running", child.pid)
 
     def list(self) -> list[Job]:
-        """The commands started in the folder; the most recent is first."""
+        """The commands started in the folder; the most recent command is first."""
         files = sorted(self._folder.glob("[0-9]*.json"), reverse=True)
         return [job for job in map(_read, files) if job is not None]
 
@@ -152,7 +152,7 @@ class Jobs:
 
 @contextmanager
 def _held_back(number: signal.Signals) -> Iterator[None]:
-    """Block a signal in this thread and in the processes that it starts, because they inherit the block."""
+    """Block a signal in this thread and in the processes started by this thread, which inherit the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield

@@ -140,7 +140,7 @@ def _contents(desk: Desk) -> dict[str, object]:
 
 
 def _redraw(desk: Desk) -> None:
-    """Redraw, in all tabs, the steps whose content has changed and those whose content is not compared."""
+    """Redraw, in all tabs, the steps whose content has changed and the steps whose content is not compared."""
     now = _contents(desk)
     for name, show in STEPS:
         if name not in now or now[name] != desk.drawn.get(name):
@@ -181,7 +181,7 @@ def _follow_changes(
         elif job != before:
             progress.refresh(job)
         # A command that has ended may have written files. An editor may have changed the study. A new text counts only
-        # if it is unchanged for a second, because a study that is being written can be incomplete.
+        # if it stays unchanged for a second, because a study that is being written can be incomplete.
         ended = job is None and desk.drawn["command"] is not None
         edited = text == watched["text"] != desk.drawn["Parameters"]
         watched.update(job=job, text=text)

@@ -65,7 +65,7 @@ def show_run(desk: Desk) -> None:
 
 
 RESUMED: Final = frozenset({"run", "validate", "trace", "predict", "map", "suggest"})
-"""Commands that keep finished work: traces in the cache, or calls of an engine in the ledger."""
+"""Commands that keep finished work: traces in the cache, or engine calls in the ledger."""
 
 
 @ui.refreshable
@@ -265,7 +265,9 @@ def better(first: str, second: str, folder: Path) -> str:
     (model, one), (other_model, other) = (errors for errors in results.values() if errors is not None)
     same = [(one.position, other.position), (one.measured_db, other.measured_db)]
     if not all(np.array_equal(*pair) for pair in same):
-        return f"{first} and {second} were validated on different links, so they cannot be compared."
+        return (
+            f"{first} and {second} were validated on different links, so the two results cannot be compared."
+        )
     judged = (one.block >= 0) & (other.block >= 0)
     if not judged.any():
         return f"{first} and {second} have no held-out link in common. Validate both with the same blocks."

@@ -53,7 +53,7 @@ def application(desk: Desk) -> FastAPI:
         except InputError as error:
             return JSONResponse({"links": [], "transmitters": [], "sites": [], "error": str(error)})
 
-    # The findings are served separately, so that the map does not have to wait for them.
+    # The findings are served separately, so that the map does not have to wait for the findings.
     @app.get("/data/findings.json")
     async def suspicions() -> Response:
         try:
