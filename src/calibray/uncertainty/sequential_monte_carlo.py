@@ -2,7 +2,7 @@
 
 A population is drawn from the prior, and follows the prior times a power of the likelihood as the power grows to 1 (P.
 Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until the
-effective size of the population falls to one half, resamples the population, and moves its members
+effective size of the population falls to half of its members, resamples the population, and moves its members
 (`population_moves.py`).
 
 We start with two independent populations, and double their number as long as the two halves of the populations disagree
