@@ -186,7 +186,7 @@ def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
             table.assign(spread_ns=np.where(table.index == 3, -3.0, table.spread_ns)),
             observables={"spread": SPREAD},
         )
-    with pytest.raises(InputError, match="two or more links"):
+    with pytest.raises(InputError, match="two or more calibration links"):
         run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
     held_out = table.assign(spread_ns=table.spread_ns.where(table.rx_x > 15))
     with pytest.raises(InputError, match="values for two or more calibration links, but has 0"):
