@@ -83,7 +83,9 @@ def test_fitted_columns_do_not_bias_the_noise():
 
 def test_uninformative_errors_are_refused():
     position = street(5)
-    with pytest.raises(InputError, match="5 links and 3 fitted columns"):
+    with pytest.raises(
+        InputError, match=r"number of links \(5\) must exceed the number of fitted columns \(3\)"
+    ):
         fit_correlation(np.ones(5), position, design=np.ones((5, 3)))
     with pytest.raises(InputError, match="all receivers have the same position"):
         fit_correlation(np.ones(5), np.zeros((5, 3)))
