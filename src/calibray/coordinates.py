@@ -1,8 +1,9 @@
 """Geographic coordinates of a scene.
 
-A scene has a local frame: x points east and y points north from an origin. Map projections distort lengths (UTM by up
-to 1 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`), centred on the
-scene. In this projection, lengths are accurate to 1 mm per kilometre within several kilometres of the centre.
+A scene has a local coordinate frame: from an origin, x points east and y points north. Map projections distort lengths
+(UTM by up to 1 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`),
+centred on the scene. In this projection, lengths are accurate to 1 mm per kilometre within several kilometres of the
+centre.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ WGS84: Final = "EPSG:4326"
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a scene: a map projection in metres, and the scene's origin in that projection.
+    """The frame of a scene: a map projection in metres, with the coordinates of the scene's origin in that projection.
 
     Attributes:
-        crs: The projection in any form that PROJ reads, such as `EPSG:32632`, a `+proj` string or WKT.
+        crs: The projection, in any form that PROJ reads, such as `EPSG:32632`, a `+proj` string or WKT.
         easting: Easting of the origin in the projection [m].
         northing: Northing of the origin in the projection [m].
-        height: Height of z = 0 above the vertical datum of geographic heights [m].
+        height: Height of the plane z = 0 above the vertical datum of the geographic heights [m].
 
     Raises:
-        InputError: The projection is unknown to PROJ or not in metres with x pointing east and y pointing north, or the
-            origin is not finite.
+        InputError: PROJ does not know the projection, the projection is not in metres with x pointing east and y
+            pointing north, or the origin is not finite.
     """
 
     crs: str
@@ -63,19 +64,19 @@ class Frame:
         """Make the local frame centred on a point; distances from this point are not distorted.
 
         The longitude is positive east of Greenwich and the latitude positive north of the equator [deg]; `height` is
-        the height of z = 0 [m].
+        the height of the plane z = 0 [m].
 
         Raises:
             InputError: The longitude or the latitude is out of range.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
-        # Rounded to 1e-7 degrees (1 cm), the string is short and states the origin exactly.
+        # Coordinates rounded to 1e-7 degrees (1 cm) keep the string short, and the string states the origin exactly.
         centre = f"+lat_0={round(float(latitude), 7)!r} +lon_0={round(float(longitude), 7)!r}"
         return cls(f"+proj=aeqd {centre} +datum=WGS84 +units=m", height=height)
 
     @classmethod
     def utm(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """Make the frame of a point's UTM zone, with the origin rounded to whole metres.
+        """Make the frame of the UTM zone that contains a point, with the origin rounded to whole metres.
 
         The arguments are those of `local`.
 
@@ -85,7 +86,7 @@ class Frame:
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
             raise InputError(f"latitude = {latitude:g}: must be -80 to 84 degrees for UTM; use a local frame")
-        # 180 degrees east would be zone 61. Regular zones suffice in Norway and Svalbard as well.
+        # A longitude of 180 degrees east would give zone 61. The regular zones also suffice in Norway and Svalbard.
         zone = min(int((longitude + 180) // 6) + 1, 60)
         crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         easting, northing, _ = cls(crs).to_scene([longitude], [latitude])[0]
@@ -96,7 +97,7 @@ class Frame:
         """Read a frame from a dictionary that `record` returned.
 
         Raises:
-            InputError: The record is not such a dictionary.
+            InputError: The record is not a dictionary with these keys.
         """
         keys = ("easting", "northing", "height")
         if not isinstance(record, Mapping) or not isinstance(record.get("crs"), str):
@@ -126,22 +127,23 @@ class Frame:
         Args:
             longitude: Longitude, positive east of Greenwich [n], [deg]; or x in the units of `crs`.
             latitude: Latitude, positive north of the equator [n], [deg]; or y in the units of `crs`.
-            height: Height of each position [n], or one height for all [m], above the vertical datum of the frame.
+            height: Height above the vertical datum of the frame [m]: one per position [n], or one for all positions.
             crs: Coordinate reference system of the positions.
-            rows: Row number of each position in its table [n], for error messages; if None, messages state the index.
+            rows: Row number of each position in its table [n], for error messages; if None, messages state the
+                position's index.
 
         Returns:
             Positions x, y, z [n, 3], [m].
 
         Raises:
-            InputError: A longitude or latitude is out of range, or a position is outside the projection's area of
-                validity.
+            InputError: A longitude or latitude is out of range, or a position is outside the area where the projection
+                is valid.
         """
         x, y, z = (np.asarray(part, dtype=float) for part in np.broadcast_arrays(longitude, latitude, height))
         if crs == WGS84:
             _check_degrees(x, y, rows)
         easting, northing = transformer(crs, self.crs).transform(x, y)
-        # Outside a projection's area of validity, PROJ returns infinity instead of raising an error.
+        # Outside the area where a projection is valid, PROJ returns infinity instead of raising an error.
         outside = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
         if len(outside):
             raise InputError(
@@ -158,10 +160,10 @@ class Frame:
 
 
 def parse_crs(crs: object) -> CRS:
-    """Look up a coordinate reference system given in any form that PROJ reads.
+    """Look up a coordinate reference system that is given in any form that PROJ reads.
 
     Raises:
-        InputError: The system is unknown to PROJ.
+        InputError: PROJ does not know the coordinate reference system.
     """
     pyproj = library("pyproj", "geo")
     try:
@@ -175,12 +177,12 @@ def parse_crs(crs: object) -> CRS:
 
 @lru_cache
 def transformer(source: object, target: object) -> Transformer:
-    """The transformation between two coordinate reference systems, with x (longitude) always first.
+    """The transformation between two coordinate reference systems; x (longitude) is always the first coordinate.
 
-    Each transformation is created once per process, which takes up to 0.3 s.
+    Creating a transformation takes up to 0.3 s, so each transformation is created only once per process.
 
     Raises:
-        InputError: One of the two systems is unknown to PROJ.
+        InputError: PROJ does not know one of the two coordinate reference systems.
     """
     pyproj = library("pyproj", "geo")
     return pyproj.Transformer.from_crs(parse_crs(source), parse_crs(target), always_xy=True)
@@ -189,9 +191,9 @@ def transformer(source: object, target: object) -> Transformer:
 def find_projection(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: Sequence[float], high: Sequence[float]
 ) -> str | None:
-    """Find the map projection of given coordinates by testing which projection places them on a scene.
+    """Find the map projection of given coordinates by testing which projection places the most positions on a scene.
 
-    Candidates are the UTM zone of the scene, Web Mercator, and the EPSG projections that cover the scene.
+    The candidates are the UTM zone of the scene, Web Mercator, and the EPSG projections that cover the scene.
 
     Args:
         x: Eastings [n].
@@ -214,13 +216,13 @@ def find_projection(
     here = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
     known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
     utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
-    # At least half of the positions must lie on the scene; of candidates with equal shares, the first is used.
+    # At least half of the positions must lie on the scene; if candidates have equal shares, the first is used.
     best, most = None, 0.5
-    # Points with equal coordinates in two geodetic datums are less than 3 km apart, usually less than 1 km.
+    # The same coordinates in two geodetic datums denote points less than 3 km apart, and usually less than 1 km.
     reach = 3000.0 + 2 * float(np.max(np.subtract(high, low)))
     for crs in dict.fromkeys([*utm, "EPSG:3857", *sorted(f"EPSG:{info.code}" for info in known)]):
         try:
-            # Projecting without a datum transformation is fast, and `reach` allows for the error.
+            # Projecting without a datum transformation is fast, and `reach` allows for the resulting error.
             east, north = pyproj.Proj(crs)(longitude, latitude)
             if not np.hypot(np.median(x) - east, np.median(y) - north) < reach:
                 continue
@@ -231,7 +233,7 @@ def find_projection(
         if share > most or (best is None and share == most):
             best, most = crs, share
         if most == 1.0:
-            break  # no other candidate can be better, and opening each takes up to 0.3 s
+            break  # no other candidate can be better, and each candidate takes up to 0.3 s to open
     return best
 
 

@@ -1,7 +1,7 @@
 """Checks whether tracing and replay work on this machine, and suggests remedies if they do not.
 
-Version numbers alone do not show this, so Dr.Jit, Sionna RT and JAX each run a small test. The tests run in
-subprocesses, because a libLLVM that Dr.Jit cannot use kills the process.
+Version numbers alone do not show whether a library works, so Dr.Jit, Sionna RT and JAX each run a small test. The tests
+run in subprocesses, because a libLLVM that Dr.Jit cannot use kills the process.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from calibray.tracing import llvm
 from calibray.tracing.llvm import Llvm
 
 CHECK_TIMEOUT = 300.0
-"""Time limit of one check [s]; the first import from a slow disk can take most of this time."""
+"""Time limit of one check [s]; from a slow disk, the first import alone can take most of this time."""
 
 # Package name and, if present, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
 _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
 
-# Extras for developing Calibray itself; users do not need them.
+# Optional dependencies for developing Calibray itself; users do not need them.
 _DEVELOPER_EXTRAS = frozenset({"test", "docs", "lint"})
 
 # Sum of min(0, 2) to min(3, 2). An unusable LLVM cannot compile the minimum, although it can compile a sum.
@@ -67,8 +67,8 @@ class Check:
 
     Attributes:
         name: The library.
-        passed: Whether it works.
-        detail: Result of the check, or the reason why it failed.
+        passed: Whether the library works.
+        detail: Result of the check, or the reason for the failure.
         remedy: Recommended action if the check failed.
     """
 
@@ -83,7 +83,8 @@ class Diagnosis:
     """The state of a machine, as `calibray doctor` prints it.
 
     Attributes:
-        versions: Python, Calibray and each required package, with its version or the command that installs it.
+        versions: Python, Calibray and each required package, each with its version or, for a missing package, the
+            installation command.
         variant: The Mitsuba variant used for tracing.
         cuda_devices: Number of GPUs on which Mitsuba can trace.
         libraries: Every libLLVM found on this machine.
@@ -102,7 +103,7 @@ class Diagnosis:
         return all(check.passed for check in self.checks)
 
     def table(self) -> Table:
-        """A table of versions, libraries, checks with remedies, and the verdict, in two columns without headings."""
+        """Tabulate versions, libraries, checks with remedies, and the verdict, in two columns without headings."""
         rows = [
             *self.versions,
             ("Mitsuba variant", self.variant),
@@ -124,7 +125,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine within a few seconds; an unusable machine raises no exception."""
+    """Check this machine, which takes a few seconds; no exception is raised if the machine is unusable."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),
@@ -136,9 +137,9 @@ def examine() -> Diagnosis:
 
 
 def check_tracing(variant: str) -> tuple[Check, ...]:
-    """Check the libraries that a Mitsuba variant needs for tracing: libLLVM (on the CPU only), Dr.Jit and Sionna RT.
+    """Check the libraries that a Mitsuba variant needs for tracing: Dr.Jit, Sionna RT and, on the CPU, libLLVM.
 
-    Returns the checks up to and including the first failure, because the later checks depend on it.
+    The returned checks end with the first failure, because the later checks depend on the earlier ones.
     """
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
@@ -159,8 +160,8 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
 def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
     """Run Python code in a subprocess to check a library.
 
-    The code prints its findings, or fails with an exception, an exit status or a signal. The detail of the returned
-    check is the output of the code, or the lines that state why the code failed.
+    The code prints its findings, or fails with an exception, an exit status or a signal. The `detail` of the returned
+    check contains the output of the code or, after a failure, the lines that state the cause.
     """
     command = [sys.executable, "-c", code, *arguments]
     try:
@@ -173,7 +174,7 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
     if run.returncode < 0:
         # LLVM prints the reason first, then a stack trace.
         return Check(name, False, f"killed by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
-    # In a chain of exceptions, the first is the cause. An exit message is the last line.
+    # In a chain of exceptions, the first exception is the cause. An exit message is the last line.
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)] or lines[-1:]
     return Check(name, False, "; ".join(reasons), remedy)
 
@@ -181,10 +182,10 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
 def versions() -> tuple[tuple[str, str], ...]:
     """Names and versions of Python, Calibray and each package that Calibray's metadata requires.
 
-    For a missing package, the command that installs it replaces the version.
+    For a missing package, the command that installs the package is listed instead of a version.
     """
     packages = {"calibray": "pip install calibray"}
-    # A copy of the source that was never installed has no metadata.
+    # A copy of the source has no metadata until it is installed.
     requirements = metadata.requires("calibray") if _version("calibray") else None
     for requirement in requirements or []:
         name, extra = _REQUIREMENT.findall(requirement)[0]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 LONGEST_MESSAGE: Final = 4000
-"""Maximum number of characters in a message; the limit is needed because values quoted from the input can be of any
+"""Maximum number of characters in a message; a limit is needed because values quoted from the input can be of any
 length."""
 
 
 def _bounded(message: str) -> str:
-    """Shorten an overlong message to its start and its end; the end states the remedy."""
+    """Shorten an overlong message to its start and its end; the end is kept because it states the remedy."""
     if len(message) <= LONGEST_MESSAGE:
         return message
     return f"{message[: LONGEST_MESSAGE - 1000]} ... {message[-900:]}"
@@ -19,8 +19,8 @@ def _bounded(message: str) -> str:
 class InputError(ValueError):
     """Input that cannot be used.
 
-    The message states the location (file, row, key), the value, the bound and the remedy. The command line prints only
-    this message, without a traceback, and exits with status 2.
+    The message states the location of the input (file, row, key), its value, the bound and the remedy. The command line
+    prints only this message, without a traceback, and exits with status 2.
     """
 
     def __str__(self) -> str:
@@ -30,7 +30,7 @@ class InputError(ValueError):
 class EngineError(RuntimeError):
     """An engine failed while running; results computed before the failure are kept.
 
-    The command line exits with status 1.
+    After this exception, the command line exits with status 1.
     """
 
     def __str__(self) -> str:

@@ -1,8 +1,8 @@
-"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 for the constants of named materials.
+"""Radio materials: the constants of a surface, and the ITU-R P.2040 laws for the constants of named materials.
 
 Below 100 GHz, P.2040-1 differs from the later revisions (relative permittivity 5.31 instead of 5.24 for concrete, 6.27
-instead of 6.31 for glass). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps the rows of that table and adds rows
-above 100 GHz and new materials. Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same
+instead of 6.31 for glass). P.2040-2 and -3 have the same Table 3. P.2040-4 keeps the rows of P.2040-3, and adds new
+materials and rows above 100 GHz. Sionna RT 2.2 follows P.2040-4; below 100 GHz, the default "P.2040-3" gives the same
 values.
 """
 
@@ -26,7 +26,7 @@ FREQUENCIES: Final = (1e6, 1e12)
 
 
 def check_frequency(frequency: object, name: str = "frequency") -> float:
-    """Check a carrier frequency [Hz] and convert it to a float; error messages call it `name`.
+    """Check a carrier frequency [Hz] and convert it to a float; error messages refer to the frequency as `name`.
 
     Raises:
         InputError: The frequency is not a number in the range `FREQUENCIES`.
@@ -63,12 +63,12 @@ SCALAR_CONSTANTS: Final = FIELDS[:5]
 
 @dataclass(frozen=True)
 class Bound:
-    """The physically possible range of one field.
+    """The physically possible range of a field's values.
 
     Attributes:
         lower: Smallest possible value, in the field's unit.
         upper: Largest possible value, in the field's unit.
-        unit: Unit of the field, "1" if it is dimensionless.
+        unit: Unit of the field; "1" if the field is dimensionless.
         open_below: Whether `lower` itself is excluded.
     """
 
@@ -101,8 +101,8 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""Bounds of each field: those of Sionna RT, except that the thickness must be greater than 0 and exponents are at most
-126. An exponent of 127 would give infinite or undefined gains."""
+"""Bounds of each field, as in Sionna RT, except that the thickness must be greater than 0 and exponents at most 126. An
+exponent of 127 would give infinite or undefined gains."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
@@ -123,8 +123,9 @@ class Material:
         xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of diffuse fields, in [0, 1].
         scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Trans.
             Antennas and Propagation 55(1), 2007).
-        alpha_r: Exponent [1] of the lobe around the specular direction, 1 to 126; rounded for Sionna RT.
-        alpha_i: Exponent [1] of the lobe back towards the source, 1 to 126; rounded for Sionna RT.
+        alpha_r: Exponent [1] of the lobe around the specular direction, 1 to 126; for Sionna RT, the exponent is
+            rounded.
+        alpha_i: Exponent [1] of the lobe back towards the source, 1 to 126; for Sionna RT, the exponent is rounded.
         lambda_: Fraction [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
 
     Raises:
@@ -154,7 +155,7 @@ class Material:
 
 
 def _within_bounds(name: str, value: Any) -> float:
-    """Convert the value of a field to a float; an `InputError` states the field, the value and the bound."""
+    """Convert a field's value to a float; if this fails, an `InputError` states the field, value and bound."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -165,7 +166,7 @@ def _within_bounds(name: str, value: Any) -> float:
 
 
 def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
-    """The constants of materials as a matrix [materials, fields], in the order of `FIELDS` and in their units.
+    """The constants of materials as a matrix [materials, fields], in the order and units of `FIELDS`.
 
     Example:
         >>> constants_matrix({"walls": Material(5.24, 0.14, 0.3)})[0, :3].tolist()
@@ -201,7 +202,7 @@ def frequency_independent_law(material: Material) -> ItuLaw:
 
 
 def law_with_stated(law: ItuLaw, material: Material, stated: Collection[str]) -> ItuLaw:
-    """The law of a material whose `stated` fields have explicit values, which do not depend on frequency."""
+    """The law of a material; the fields in `stated` have explicit values that do not depend on frequency."""
     # P.2040: permittivity a f^b, conductivity c f^d.
     if "relative_permittivity" in stated:
         law = law._replace(a=material.relative_permittivity, b=0.0)
@@ -216,7 +217,7 @@ def _table(rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
 
 
 def _extended(base: _Table, rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
-    """A table with `rows` added after those of `base`; where frequency ranges overlap, the rows of `base` apply."""
+    """Append `rows` to the rows of `base`; where frequency ranges overlap, the rows of `base` apply."""
     return _table({name: (*base.get(name, ()), *rows.get(name, ())) for name in {**base, **rows}})
 
 
@@ -284,7 +285,8 @@ _P2040_4: Final = _extended(
 ITU_MATERIALS: Final[Mapping[str, _Table]] = MappingProxyType(
     {"P.2040-1": _P2040_1, "P.2040-2": _P2040_2, "P.2040-3": _P2040_2, "P.2040-4": _P2040_4}
 )
-"""ITU-R P.2040 Table 3 by revision and material; where ranges overlap, the first row applies, as in Sionna RT."""
+"""ITU-R P.2040 Table 3 by revision and material; where frequency ranges overlap, the first row applies, as in Sionna
+RT."""
 
 DEFAULT_REVISION: Final = "P.2040-3"
 
@@ -296,9 +298,8 @@ def itu_material(
 
     Args:
         name: Name of the material as in Sionna RT, for instance "concrete" or "very_dry_ground".
-        frequency: Frequency [Hz], within the range of the material's law, including its limits.
-        thickness: Thickness of the slab [m]; P.2040 does not specify a thickness, and 0.1 m is the default of Sionna
-            RT.
+        frequency: Frequency [Hz], within the range of the material's law; the limits are included.
+        thickness: Thickness of the slab [m]; P.2040 specifies no thickness, so the default is that of Sionna RT, 0.1 m.
         revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
         **scattering: Other fields of the `Material`, for instance ``scattering_coefficient=0.3``.
 
@@ -326,7 +327,7 @@ def itu_material(
 
 
 def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> ItuLaw:
-    """Find the row of ITU-R P.2040 Table 3 that applies to a material, named as in Sionna RT, at a frequency [Hz].
+    """Find the row of ITU-R P.2040 Table 3 for a material at a frequency [Hz]; materials are named as in Sionna RT.
 
     Raises:
         InputError: The revision or the name is unknown, or no law covers the frequency.

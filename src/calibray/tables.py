@@ -1,7 +1,7 @@
-"""Tables as data, and the rendering of tables and sentences as plain text and HTML.
+"""Tables as data, and functions that render tables and sentences as plain text and HTML.
 
 Control characters and markup are escaped, because some names come from files. The Python prompt and notebooks show
-shortened forms.
+shortened tables and sentences.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from typing import Final, Literal
 from calibray.support.messages import printable
 
 LISTED: Final = 12
-"""Largest number of rows, names or findings that are listed; further ones are only counted."""
+"""Maximum number of rows, names or findings in a list; the remaining items are only counted."""
 
 WIDEST: Final = 100_000
-"""Number of characters per line if the output is not a terminal or the terminal is too narrow; large enough for every
-cell."""
+"""Number of characters per line if the output is not a terminal or the terminal is too narrow; every cell fits in a
+line of this length."""
 
 ROWS: Final = 10
-"""Largest number of rows of a table shown at the prompt; further rows are only counted."""
+"""Maximum number of table rows shown at the prompt; the remaining rows are only counted."""
 
 CHARACTERS: Final = 60
-"""Largest number of characters shown for a cell or a name; longer text is cut."""
+"""Maximum number of characters shown of a cell or a name; longer text is cut."""
 
 SENTENCE: Final = 200
-"""Largest number of characters shown for a sentence; longer sentences are cut."""
+"""Maximum number of characters shown of a sentence; longer sentences are cut."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: The quantity in the cells; empty for the column of row names.
-        unit: Unit of all cells; empty if the cells have no unit or different units.
+        name: The quantity in the cells; empty for the column that contains the row names.
+        unit: The unit that all cells share; empty if the cells have no unit or have different units.
         align: "left" for text, "right" for numbers.
 
     Example:
@@ -68,7 +68,7 @@ class Table:
     Attributes:
         title: The title; may be empty.
         columns: The columns.
-        rows: The cells of every row, one per column.
+        rows: The cells of each row, one for every column.
 
     Raises:
         ValueError: A row has more or fewer cells than there are columns.
@@ -92,7 +92,7 @@ class Table:
 
     @property
     def titled(self) -> bool:
-        """Whether the title is shown above the table; otherwise it is the heading of the first column."""
+        """Whether the title is shown above the table; if not, the title is the heading of the first column."""
         return bool(self.title) and bool(self.columns[0].heading)
 
     @property
@@ -107,7 +107,7 @@ class Table:
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The table with its first `count` rows; if rows are left out, a last row states their number.
+        """Shorten the table to its first `count` rows; if rows are left out, a last row states how many.
 
         Example:
             >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows
@@ -120,7 +120,7 @@ class Table:
 
 
 def render(*parts: Table | str) -> str:
-    """Render tables and sentences as plain text, with a blank line between them; empty strings are omitted.
+    """Render tables and sentences as plain text, separated by blank lines; empty strings are omitted.
 
     Example:
         >>> print(render("study.toml", Table("Cost", (Column(), numbers()), (("tracing", "0.3 s"),))))
@@ -148,7 +148,7 @@ def render_html(*parts: Table | str) -> str:
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """List at most `LISTED` row numbers of a file, and count the others; without rows, the text is empty.
+    """List at most `LISTED` row numbers of a file, and count the others; if there are no rows, the text is empty.
 
     Example:
         >>> rows_text([3, 4, 9])
@@ -169,12 +169,12 @@ def decibels(value: float | None) -> str:
 
 
 def short_text(*parts: Table | str) -> str:
-    """Plain text for `__repr__`, with long tables and cells cut, and control characters escaped."""
+    """Render plain text for `__repr__`; long tables and cells are cut, and control characters are escaped."""
     return render(*_fitted(parts))
 
 
 def short_html(*parts: Table | str) -> str:
-    """HTML for `_repr_html_`, with long tables and cells cut, and all text escaped."""
+    """Render HTML for `_repr_html_`; long tables and cells are cut, and all text is escaped."""
     return render_html(*_fitted(parts))
 
 
@@ -215,7 +215,7 @@ def _lines(table: Table) -> str:
         show_header=table.headed, pad_edge=False, show_edge=False,
     )  # fmt: skip
     for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
-        # The first column names the rows, and a single column contains sentences.
+        # The first column contains the names of the rows; the only column of a table contains sentences.
         is_text = column.align == "left" and (index > 0 or len(table.columns) == 1)
         # Rich takes the longest word as the minimum width, even where a cell must not wrap.
         cells = (heading, *(row[index] for row in table.rows))

@@ -209,7 +209,10 @@ def test_the_command_counts_links_without_a_path(shadowed: Result, tmp_path: Pat
     run = CliRunner().invoke(app, ["predict", str(folder), str(tmp_path / "new.csv")])
     assert run.exit_code == 0, run.output
     assert run.stderr.startswith("Tracing 2 links: ")
-    assert "Warning: no path: 1 of 2 links, row 3\nThe log-distance model predicts" in run.stderr
+    assert (
+        "Warning: no path: 1 of 2 links, row 3\nFor links without a path, the log-distance model predicts"
+        in run.stderr
+    )
     assert run.stdout.splitlines()[0].endswith("path_loss_db,basis")
     assert run.stdout.splitlines()[2].endswith("no path: log-distance")
 

@@ -127,7 +127,7 @@ def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeyp
     write_text(tmp_path / "out" / "map.csv", "of the first run")
     second = run(*arguments)
     assert second.exit_code == 0
-    assert f"the map in {tmp_path / 'out'} (map.csv) is that of an earlier run" in second.stderr
+    assert f"the map in {tmp_path / 'out'} (map.csv) belongs to an earlier run" in second.stderr
     assert len(programs.calls(tmp_path)) == 19
     assert Result.load(tmp_path / "out").parameters == parameters
     listed = run("ledger", tmp_path / "out")
@@ -207,7 +207,7 @@ def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):
     assert cost.startswith("Tracing 12 links: ")
     assert warnings == (
         f"Warning: no path: {lost}Warning: receiver inside a building: {lost}"
-        "The log-distance model predicts the links without a path; see the column basis\n"
+        "For links without a path, the log-distance model predicts path loss; see the column basis\n"
     )
 
 
@@ -245,7 +245,10 @@ def test_a_validation_is_not_written_into_a_result_of_changed_links(folder, ran)
     finally:
         file.write_text(before)
     assert (outcome.exit_code, outcome.stdout) == (2, "")
-    assert "links.csv changed since its result was calibrated; run the study again" in outcome.stderr
+    assert (
+        "links.csv changed since the result in this folder was calibrated; run the study again"
+        in outcome.stderr
+    )
 
 
 def test_a_model_that_predictions_do_not_use_yet_is_named(folder, ran, tmp_path):

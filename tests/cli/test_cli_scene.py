@@ -147,7 +147,7 @@ def write_town(path: Path, *properties: dict, move: tuple[float, float] = (0.0, 
         (
             ["--origin", "48.1374,11.5755"],
             (0, 0),
-            r"the buildings are [\d,]+ km from it; give longitude first",
+            r"the buildings are [\d,]+ km from this origin; give longitude first",
         ),
         (
             ["--height", "tall"],

@@ -1,4 +1,4 @@
-"""The command line: commands that parse arguments, call the package and print results."""
+"""The command line: each command parses its arguments, calls the package and prints the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The application: its commands and its error handling.
+"""The command-line application: its commands and its error handling.
 
 Data are written to stdout; progress and messages are written to stderr. The exit status is 0 for success, 1 for a
 failure while running, 2 for bad input, 130 for Ctrl-C and 143 for SIGTERM. Each command imports its dependencies when
@@ -31,7 +31,7 @@ class Commands(TyperGroup):
     """A group of commands that reports expected failures with a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse overlong and empty arguments, then parse."""
+        """Refuse overlong and empty arguments, then parse the arguments."""
         for argument in args:
             if len(argument) > LONGEST:
                 ctx.fail(f"an argument has {len(argument)} characters; the maximum is {LONGEST}")
@@ -44,8 +44,8 @@ class Commands(TyperGroup):
         """Run the command, and convert errors to exit statuses.
 
         Raises:
-            typer.Exit: With status 2 for bad input, 1 for any other expected failure, 130 for Ctrl-C, and 143 for
-                SIGTERM.
+            typer.Exit: The exit status is 2 for bad input, 1 for any other expected failure, 130 for Ctrl-C, and 143
+                for SIGTERM.
             BrokenPipeError: The reader of stdout has closed the stream; Typer handles this error.
         """
         try:
@@ -71,7 +71,8 @@ class Commands(TyperGroup):
             echo(f"Error: {file}{fault}", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
-            # The command itself reports what was kept. An error during the interruption is reported here.
+            # The interrupted command itself reports which results were kept. An error that occurred during the
+            # interruption is reported here.
             if isinstance(error.__cause__, (InputError, EngineError)):
                 echo(f"Error: {error.__cause__}", err=True)
             echo("Interrupted", err=True)
@@ -84,12 +85,11 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    # Plain help: Rich would double the time that --help takes.
+    # The help is plain text because Rich would double the time that --help takes.
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-"""All commands. To add a command, write a function in a module of this package and add the function to the list
-below."""
+"""All commands. To add a command, write a function in a module of this package, and add it to the list below."""
 
 
 def _print_version(requested: bool) -> None:
@@ -115,8 +115,8 @@ for command in (  # in the order of `--help`
     doctor, demo, open, init, schema, run, report, compare, validate, trace, predict, map, suggest, export, ledger,
     cache,
 ):  # fmt: skip
-    # Without a short help, Typer truncates the summary. The help omits the section Raises, which matters only to Python
-    # callers.
+    # Without `short_help`, Typer truncates the summary. The help omits the "Raises" section, which matters only to
+    # Python callers.
     text = (command.__doc__ or "").partition("\n    Raises:")[0]
     app.command(help=text, short_help=text.partition("\n\n")[0])(command)
 app.add_typer(scene)

@@ -1,6 +1,6 @@
-"""The console for messages and progress, and arguments shared by several commands.
+"""The console for messages and progress, and the arguments that several commands share.
 
-On a terminal, progress is shown as bars. Otherwise, a plain line is printed every few seconds.
+On a terminal, progress is shown by bars. Otherwise, a plain line is printed every few seconds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def log() -> Console:
 
 
 def echo(text: str, err: bool = False, nl: bool = True) -> None:
-    """Print text with control characters escaped, so that names from files cannot control the terminal."""
+    """Print text, with control characters escaped so that names from files cannot control the terminal."""
     from calibray.support.messages import printable
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
@@ -47,7 +47,7 @@ def echo(text: str, err: bool = False, nl: bool = True) -> None:
 
 @cache
 def print_costs() -> None:
-    """Make every prediction print its cost to stderr before it starts."""
+    """Make every prediction print its expected cost to stderr before the prediction starts."""
     import logging
 
     class Echo(logging.Handler):
@@ -62,7 +62,7 @@ def print_costs() -> None:
 
 
 def option(placeholder: str, meaning: str, *names: str, **limits: Any) -> Any:
-    """An option with a value; `names` is needed only if the option is not named after the argument."""
+    """An option that takes a value; `names` is needed only if the option and the argument have different names."""
     return typer.Option(*names, metavar=placeholder, help=meaning, **limits)
 
 
@@ -77,7 +77,7 @@ ResultFolder = Annotated[
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace existing files that Calibray did not write.")
 ]
-"""Whether output may replace a user's file; an input is never replaced."""
+"""Whether output may replace a user's file; an input file is never replaced."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,16 @@ class Pool:
     """Options for the workers; the fields are the arguments of `calibray.engines.open_workers`."""
 
     workers: Annotated[
-        int | None, option("N", "Number of local processes that share the chunks of links.")
+        int | None, option("N", "Number of local processes among which the chunks of links are divided.")
     ] = None
     scheduler: Annotated[
-        str | None, option("ADDRESS", "Dask scheduler whose workers process chunks of links.")
+        str | None, option("ADDRESS", "Address of the Dask scheduler whose workers process chunks of links.")
     ] = None
 
 
 @dataclass(frozen=True)
 class Permissions:
-    """Options that permit operations that are otherwise refused."""
+    """Options that permit operations that Calibray otherwise refuses."""
 
     allow_changed_inputs: Annotated[
         bool,
@@ -107,7 +107,7 @@ class Permissions:
 
 
 def read_origin(text: str) -> tuple[float, float]:
-    """Read the longitude and latitude [deg] of ``--origin``.
+    """Read the longitude and latitude [deg] from the text of ``--origin``.
 
     Raises:
         InputError: The text is not a valid longitude and latitude.
@@ -124,7 +124,7 @@ def read_origin(text: str) -> tuple[float, float]:
 
 
 def with_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Convert a command so that every field of its dataclass arguments becomes an option."""
+    """Convert a command so that each field of its dataclass arguments becomes a command-line option."""
     arguments: dict[str, Any] = get_type_hints(command, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in arguments.items() if is_dataclass(kind)}
     options: list[Parameter] = []
@@ -162,17 +162,17 @@ def warn(study: Study, links: Measurements) -> None:
 
 
 LINE_INTERVAL: Final = 4.0
-"""Interval between progress lines if stderr is not a terminal [s]; shorter work prints no line."""
+"""Interval between progress lines if stderr is not a terminal [s]; work that ends sooner prints no line."""
 
 STARTING: Final = "starting"
-"""The stage shown until the work reports its first stage, for example during imports."""
+"""The stage that is shown, for example during imports, until the work reports its first stage."""
 
 
 def progress_bars(console: Console, every: float | None = None) -> AbstractContextManager[Progress]:
-    """Show progress by stage: bars on a terminal, otherwise lines at least `every` seconds apart.
+    """Show the progress of each stage, as bars on a terminal and otherwise as lines at least `every` seconds apart.
 
     Returns:
-        A context manager; its value is a function of the stage, the amount done and the total (None if unknown).
+        A context manager that yields a function of the stage, the amount done and the total (None if unknown).
     """
     return _bars(console) if console.is_terminal else _lines(console, every or LINE_INTERVAL)
 
@@ -195,7 +195,7 @@ def _bars(console: Console) -> Iterator[Progress]:
         *columns,
         console=console,
         transient=True,
-        # [s]; a launch of rays can take longer than the 30 s over which Rich averages by default.
+        # In [s]; a launch of rays can take longer than the 30 s over which Rich averages by default.
         speed_estimate_period=3600.0,
     ) as bars:
         tasks = {STARTING: bars.add_task(STARTING, total=1)}
@@ -203,7 +203,7 @@ def _bars(console: Console) -> Iterator[Progress]:
         def report(stage: str, done: int, total: int | None) -> None:
             if STARTING in tasks:
                 bars.remove_task(tasks.pop(STARTING))
-            # Without a total and with nothing done, the stage is a single step.
+            # If there is no total and nothing is done, the stage is shown as a single step.
             shown_total = 1 if total is None and not done else total
             name = stage.partition(": ")[0]
             if name not in tasks:
@@ -237,7 +237,7 @@ class _State:
 
 @contextmanager
 def _lines(console: Console, every: float) -> Iterator[Progress]:
-    """Print lines from a separate thread, so that they also appear while the work reports no progress."""
+    """Print progress lines from a separate thread, so that lines also appear while the work reports no progress."""
     state, finished = _State(), Event()
 
     def print_lines() -> None:
@@ -254,7 +254,7 @@ def _lines(console: Console, every: float) -> Iterator[Progress]:
 
 
 def line(stage: str, done: int, total: int | None, seconds: float) -> str:
-    """Stage, share, rate, elapsed time and remaining time as one line; unknown values are left out.
+    """Format stage, share, rate, elapsed time and remaining time as one line; unknown values are left out.
 
     Example:
         >>> line("tracing", 30, 120, 15.0)

@@ -1,4 +1,4 @@
-"""`calibray doctor`, `cache` and `ledger`: check this machine or a scene, and manage files kept between runs."""
+"""`calibray doctor`, `cache` and `ledger`: check this machine or a scene, and manage the files kept between runs."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def doctor(
         ),
     ] = None,
     plot: Annotated[
-        Path | None, option("FILE", "Draw the study's antennas over its scene (.png, .svg or .pdf).")
+        Path | None, option("FILE", "Draw the study's antennas on a plan of its scene (.png, .svg or .pdf).")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Check whether tracing and replay work on this machine, or whether a scene can be used."""
     if subject is None:
         if plot is not None:
-            raise InputError("--plot draws the antennas of a study: name the study file")
+            raise InputError("--plot draws the antennas of a study; name the study file")
         _machine()
     else:
         _scene(subject, plot, overwrite)
@@ -64,7 +64,9 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
         study = Study.load(subject) if subject.lower().endswith(".toml") else None
         if plot is not None and study is None:
-            raise InputError(f"--plot draws the antennas of a study: {subject} is a scene, name a study file")
+            raise InputError(
+                f"--plot draws the antennas of a study, but {subject} is a scene; name a study file"
+            )
         source = subject if study is None else study.scene_source
         check = check_scene(source, progress)
     echo(render(*scene_tables.findings(check), scene_tables.objects(check)))
@@ -75,7 +77,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
 
 def _draw(study: Study, plot: Path, overwrite: bool) -> None:
-    """Draw a study's antennas over its scene."""
+    """Draw a study's antennas on a plan of its scene."""
     from calibray.reporting.link_map import save_positions
 
     links = study.measurements()
@@ -86,7 +88,8 @@ def _draw(study: Study, plot: Path, overwrite: bool) -> None:
 def cache(clear: Annotated[bool, typer.Option("--clear", help="Remove all cached files.")] = False) -> None:
     """Show where traces and compiled programs are kept between runs, or remove them.
 
-    The environment variable CALIBRAY_CACHE sets the folder. If it is set but empty, Calibray caches nothing.
+    The environment variable CALIBRAY_CACHE sets the cache folder. If this variable is set but empty, Calibray caches
+    nothing.
     """
     from calibray.support.cache_folder import cache_folder, compiled_programs
     from calibray.tables import Column, Table, numbers, render
@@ -114,10 +117,11 @@ def ledger(
         typer.Argument(metavar="DIR", help="Folder that `calibray run` writes into.", show_default=False),
     ],
     out: Annotated[
-        Path | None, option("FILE", "Write a CSV or Parquet file with every link's path loss.", "--out", "-o")
+        Path | None,
+        option("FILE", "Write a CSV or Parquet file with the path loss of every link.", "--out", "-o"),
     ] = None,
     forget_failed: Annotated[
-        bool, typer.Option("--forget-failed", help="Remove failed calls, so that they run again.")
+        bool, typer.Option("--forget-failed", help="Remove failed calls, so that the next run repeats them.")
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -142,7 +146,7 @@ def ledger(
 
 
 def calls_table(frame: pd.DataFrame) -> Table:
-    """The RT calls of a ledger, one row per call; the last column is the first line of the call's message."""
+    """Tabulate the RT calls of a ledger, one row per call; the last column is the first line of the call's message."""
     from pandas.api.types import is_numeric_dtype
 
     from calibray.tables import Column, Table, numbers

@@ -19,13 +19,20 @@ class Known:
 
     transmitters: Annotated[Path | None, option("FILE", "Table of transmitter positions.")] = None
     track: Annotated[
-        Path | None, option("FILE", "GPX track that gives each row its position at the time of the row.")
+        Path | None,
+        option("FILE", "GPX track from which each row takes its position, according to the time in the row."),
     ] = None
-    antennas: Annotated[Path | None, option("DIR", "Folder of MSI files named after the antennas.")] = None
+    antennas: Annotated[
+        Path | None, option("DIR", "Folder of MSI files that are named after the antennas.")
+    ] = None
     tx: Annotated[str | None, option("X,Y,Z", "Transmitter position in the scene frame [m].")] = None
     frequency: Annotated[float | None, option("HZ", "Carrier frequency [Hz].")] = None
     origin: Annotated[
-        str | None, option("LON,LAT", "Origin of the scene frame [deg], if the scene file does not state it.")
+        str | None,
+        option(
+            "LON,LAT",
+            "Origin of the scene frame [deg]; needed only if the scene file does not state the origin.",
+        ),
     ] = None
 
 
@@ -46,13 +53,13 @@ def init(
     *,
     known: Known,
     plot: Annotated[
-        Path | None, option("FILE", "Draw the antennas over the scene (.png, .svg or .pdf).")
+        Path | None, option("FILE", "Draw the antennas on a plan of the scene (.png, .svg or .pdf).")
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a plot that Calibray did not write.")
     ] = False,
 ) -> None:
-    """Draft a study from a scene and a table of links, and list its assumptions with their reasons."""
+    """Draft a study from a scene and a table of links, and list the assumptions made, with the reasons."""
     from calibray.support.output_files import check_file, write_text
 
     if out.exists() or out.is_symlink():
@@ -111,7 +118,7 @@ def _position(text: str) -> list[float]:
 
 
 def schema() -> None:
-    """Print the JSON schema of study files, which editors use for completion and checks."""
+    """Print the JSON schema of study files; editors use the schema to complete and check them."""
     from calibray.study.draft import schema_text
 
     echo(schema_text(), nl=False)
@@ -127,8 +134,8 @@ def open(
 ) -> None:
     """Work on a study in the browser instead of a terminal, from a map and measurements to predictions.
 
-    The page is served on this machine only, at an address with a token. Ctrl-C ends the server, but not commands in
-    progress.
+    The page is served only on this machine, at an address that contains a secret token. Ctrl-C ends the server, but not
+    commands in progress.
 
     Raises:
         InputError: NiceGUI is not installed, or the folder or the port cannot be used.

@@ -33,13 +33,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
-"""Columns that `predict` adds; all except the first require --level. Other measured quantities add further columns."""
+"""Columns that `predict` adds; all columns except the first require --level. If the study measures a quantity other
+than path loss, `predict` adds further columns."""
 
 UNREACHED: Final = "no path"
 """The warning about links without a path."""
 
 TEXTS: Final = ("basis", "remark")
-"""Text columns that `predict` adds; the remark requires --level."""
+"""Text columns that `predict` adds; the column `remark` requires --level."""
 
 
 @with_groups
@@ -55,7 +56,13 @@ def predict(
         ),
     ],
     out: Annotated[
-        Path | None, option("FILE", "CSV or Parquet file to write instead of CSV on stdout.", "--out", "-o")
+        Path | None,
+        option(
+            "FILE",
+            "CSV or Parquet file to write; without this option, CSV is printed to stdout.",
+            "--out",
+            "-o",
+        ),
     ] = None,
     level: Annotated[
         float | None,
@@ -63,7 +70,7 @@ def predict(
             "P",
             "Add the interval that contains a measurement with this probability, such as 0.9, as the columns lower_db "
             "and upper_db. Also add a remark if an antenna is inside a building or outside the scene, or if the link "
-            "is far weaker than every link used by the calibration.",
+            "is far weaker than all links used in the calibration.",
         ),
     ] = None,
     *,
@@ -72,8 +79,8 @@ def predict(
 ) -> None:
     """Predict path loss for new links with the calibrated scene.
 
-    The column `basis` names the model used for each prediction. Links without a path are predicted by the log-distance
-    model.
+    The column `basis` names the model used for each prediction. For links without a path, the log-distance model
+    predicts path loss.
     """
     with progress_bars(log()) as progress:
         import numpy as np
@@ -92,7 +99,7 @@ def predict(
         study, table = result.study, PiecedTable.open(links_file)
         first = as_links(result, next(table.pieces(1)))
         names, texts = (PREDICTIONS[:1], TEXTS[:1]) if level is None else (PREDICTIONS, TEXTS)
-        # A prediction of NaN for the first link shows which columns the measured quantity adds.
+        # Converting a prediction of NaN for the first link shows which columns the measured quantity adds.
         measured = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
         further = observable_columns(study, level)
         renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *further, *texts))
@@ -111,7 +118,7 @@ def predict(
                 columns = {name: predictions[name].to_numpy() for name in (*names, *texts)}
                 measured = as_measured(study, links, predictions)
                 measured |= {name: predictions[name].to_numpy() for name in further if name in predictions}
-                # Column order: predictions, basis, the measured quantity, remark.
+                # The order of the columns is predictions, basis, the measured quantity, remark.
                 remark = {} if level is None else {"remark": columns.pop("remark")}
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
@@ -121,12 +128,12 @@ def predict(
     if UNREACHED in warnings and result.prediction.fallback is not None:
         received = study.links.noise_floor_dbm is not None
         reason = (
-            ". It is fitted to links above the noise floor, so the true powers may be much lower"
+            ". This model is fitted to links above the noise floor, so the true powers may be much lower"
             if received
             else ""
         )
         echo(
-            f"The log-distance model predicts the links without a path; see the column basis{reason}",
+            f"For links without a path, the log-distance model predicts path loss; see the column basis{reason}",
             err=True,
         )
     if out is not None:
@@ -135,7 +142,7 @@ def predict(
 
 @contextmanager
 def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
-    """Yield a function that prints tables as CSV, with a header before the first table."""
+    """Yield a function that prints tables as CSV, with the header only before the first table."""
     from calibray.support.output_files import csv_text
 
     header = True
@@ -151,7 +158,7 @@ def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
 def _collect_warnings(
     warnings: dict[str, array[int]], row: NDArray[np.int64], predictions: pd.DataFrame
 ) -> None:
-    """Add the rows of links without a path, and of links with remarks, to the warnings."""
+    """Add the row numbers of links without a path, and of links with remarks, to the warnings."""
     from calibray.result.held_out import NO_PATH
 
     rows: dict[str, list[int]] = {}
@@ -161,7 +168,7 @@ def _collect_warnings(
         for remark in filter(None, remarks.split(", ")):
             rows.setdefault(remark, []).append(number)
     for warning, numbers_of_rows in rows.items():
-        # An array takes 8 bytes per row, so a million rows take 8 MB; a list of integers would take 36 MB.
+        # An array needs 8 bytes per row, or 8 MB for a million rows; a list of integers would need 36 MB.
         warnings.setdefault(warning, array("q")).extend(numbers_of_rows)
 
 
@@ -175,7 +182,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:
-    """New names for columns of the table that share a name with a prediction, such as measured path loss."""
+    """Choose new names for table columns that have the same name as a prediction, such as measured path loss."""
     renamed = {name: f"input_{name}" for name in columns if name in frame}
     for name, new in renamed.items():
         if new in frame:
@@ -188,13 +195,16 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
 class SuggestOptions:
     """Options for the suggestions and their output."""
 
-    count: Annotated[int, option("N", "Largest number of links to suggest.", min=1)] = 5
+    count: Annotated[int, option("N", "Maximum number of links to suggest.", min=1)] = 5
     out: Annotated[
         Path | None, option("FILE", "Also write the table to this CSV or Parquet file.", "--out", "-o")
     ] = None
     observables: Annotated[
         bool,
-        typer.Option("--observables", help="Also report which further observable is worth measuring there."),
+        typer.Option(
+            "--observables",
+            help="Also report which further observable is worth measuring on each suggested link.",
+        ),
     ] = False
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False
 
@@ -206,14 +216,14 @@ def suggest(
         Path,
         typer.Argument(
             metavar="CANDIDATES",
-            help="CSV or Parquet file of candidate links, with the columns that `calibray predict` reads.",
+            help="CSV or Parquet file of candidate links, with the same columns as for `calibray predict`.",
             show_default=False,
         ),
     ],
     options: SuggestOptions,
     permissions: Permissions,
 ) -> None:
-    """Suggest where to measure next: the candidate links whose measurement is expected to narrow the intervals most."""
+    """Suggest where to measure next: the candidate links whose measurement should narrow the intervals most."""
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.measurements.table_files import read_table
@@ -239,7 +249,8 @@ def suggest(
     )
     model = str(result.prediction.model.name)
     echo(
-        "Note: path loss is the mean over the draws of the calibrated model; `calibray predict`, which uses the model "
+        "Note: the path loss shown is the mean over the draws of the calibrated model; `calibray predict`, which uses "
+        "the model "
         f"{model!r}, may give other values.",
         err=True,
     )
@@ -249,7 +260,7 @@ def suggest(
 
 
 def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
-    """Tables of the suggested positions and of the gain expected from measuring each one and those ranked above it."""
+    """Tables of the suggested positions, and of the gain expected from measuring each and those ranked above it."""
     from calibray.measurements.placement import POSITION_COLUMNS
 
     grouped = ["group"] if "group" in suggestions else []
@@ -268,7 +279,7 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
         rows.append((str(rank), str(row["row"]), *position, *(str(row[name]) for name in grouped), *losses))
         gains.append((str(rank), row["gain"]))
     expected = Table(
-        "Expected 95 % intervals after measuring this link and those above",
+        "Expected 95 % intervals after measuring this link and the links above",
         (numbers("rank"), Column("gain")),
         tuple(gains),
     )
@@ -278,7 +289,11 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
     worth = suggestions[["observable", "observable_gain"]].itertuples(index=False)
     further = Table(
         "Further observables to measure there",
-        (numbers("rank"), Column("observable"), Column("expected 95 % intervals, relative to those above")),
+        (
+            numbers("rank"),
+            Column("observable"),
+            Column("expected 95 % intervals, relative to those with path loss alone"),
+        ),
         tuple((str(rank), *(str(value) for value in row)) for rank, row in enumerate(worth, start=1)),
     )
     return *tables, further
@@ -292,14 +307,17 @@ class Area:
         tuple[float, float, float] | None,
         option(
             "X Y Z",
-            "Transmitter position [m]; by default the transmitter of the links, if there is only one.",
+            "Transmitter position [m]; by default that of the links' transmitter, if there is only one.",
         ),
     ] = None
     height: Annotated[float, option("M", "Height of the receivers above the ground [m].")] = 1.5
     cell: Annotated[float, option("M", "Width of the cells [m].")] = 5.0
     bounds: Annotated[
         tuple[float, float, float, float] | None,
-        option("W S E N", "West, south, east and north limits of the area [m]; by default the whole scene."),
+        option(
+            "W S E N",
+            "West, south, east and north limits of the area [m]; by default, the map covers the whole scene.",
+        ),
     ] = None
 
 
@@ -308,7 +326,7 @@ class Values:
     """Options for the predicted values."""
 
     level: Annotated[
-        float, option("P", "Probability that a measurement lies in the interval; 0 for no interval.")
+        float, option("P", "Probability that a measurement lies in the interval; 0 omits the interval.")
     ] = 0.9
     power: Annotated[
         float | None, option("DBM", "Transmitted power [dBm], to map received power instead of path loss.")
@@ -317,14 +335,14 @@ class Values:
         str | None,
         option(
             "N|auto",
-            "Number of rays to use instead of the study's. More rays take longer; with too few, paths are missed.",
+            "Number of rays to use instead of the study's number. More rays take longer; too few rays miss paths.",
         ),
     ] = None
     column: Annotated[
         list[str] | None,
         option(
             "NAME=VALUE",
-            "Value of a group or frequency column of the links for this transmitter; can be repeated.",
+            "Value, for this transmitter, of a group or frequency column of the links; the option can be repeated.",
         ),
     ] = None
 
@@ -334,14 +352,16 @@ def map(
     folder: ResultFolder,
     area: Area,
     values: Values,
-    out: Annotated[Path | None, option("FOLDER", "Folder for the map instead of DIR.", "--out", "-o")] = None,
+    out: Annotated[
+        Path | None, option("FOLDER", "Folder for the map; by default DIR.", "--out", "-o")
+    ] = None,
     *,
     pool: Pool,
     permissions: Permissions,
 ) -> None:
     """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv.
 
-    Cells without a path are predicted by the log-distance model and hatched in the map.
+    In cells without a path, the log-distance model predicts path loss; these cells are hatched on the map.
     """
     target = out or folder
     with progress_bars(log()) as progress:
@@ -356,7 +376,7 @@ def map(
         print_costs()
         result = Result.load(folder, allow_changed_inputs=permissions.allow_changed_inputs)
         inputs = result.study.files()
-        # Checked before tracing, which takes a long time.
+        # The outputs are checked before tracing, because tracing takes a long time.
         check_outputs(target, FILES, inputs, permissions.overwrite)
         with open_workers(pool.workers, pool.scheduler) as workers:
             coverage = coverage_map(
@@ -399,7 +419,7 @@ def _samples(text: str) -> int | Literal["auto"]:
 
 
 def _columns(entries: list[str]) -> dict[str, object]:
-    """Values by column; numeric values are converted to numbers."""
+    """Read the values of columns from NAME=VALUE entries, and convert numeric values to numbers."""
     columns: dict[str, object] = {}
     for entry in entries:
         name, equals, value = entry.partition("=")
@@ -408,7 +428,7 @@ def _columns(entries: list[str]) -> dict[str, object]:
         if name in columns:
             raise InputError(f"--column {entry}: {name} is given twice; remove one")
         try:
-            # Python reads 1_2 as 12, but tables keep it as text.
+            # Python reads 1_2 as 12, but tables keep 1_2 as text.
             columns[name] = value if "_" in value else float(value)
         except ValueError:
             columns[name] = value

@@ -40,30 +40,31 @@ class Changes:
     """Options that override those of the study."""
 
     method: Annotated[
-        str | None, option("NAME", "Method to use instead of the study's: auto, sgwo-im, gwo, ...")
+        str | None, option("NAME", "Method to use instead of the study's method: auto, sgwo-im, gwo, ...")
     ] = None
-    seed: Annotated[int | None, option("N", "Seed to use instead of the study's.")] = None
+    seed: Annotated[int | None, option("N", "Seed to use instead of the study's seed.")] = None
     engine: Annotated[
-        str | None, option("NAME", "Engine to use instead of the study's: replay, retrace or command.")
+        str | None, option("NAME", "Engine to use instead of the study's engine: replay, retrace or command.")
     ] = None
 
 
 @dataclass(frozen=True)
 class RunPool:
-    """Options for the workers, which can also run an external program."""
+    """Options for the workers; these can also run an external program."""
 
     workers: Annotated[
         int | None,
         option(
             "N",
-            "Number of local processes that share the chunks of links, or of programs that the engine 'command' runs "
-            "in parallel.",
+            "Number of local processes among which the chunks of links are divided, or number of programs that the "
+            "engine 'command' runs in parallel.",
         ),
     ] = None
     scheduler: Annotated[
         str | None,
         option(
-            "ADDRESS", "Dask scheduler whose workers process chunks of links, or run the engine 'command'."
+            "ADDRESS",
+            "Address of the Dask scheduler whose workers process chunks of links, or run the engine 'command'.",
         ),
     ] = None
 
@@ -89,7 +90,7 @@ def run(
     pool: RunPool,
     output: Output,
 ) -> None:
-    """Calibrate a study, print the result, and write it with the calibrated scene and a report."""
+    """Calibrate a study, print the result, and write the result, the calibrated scene and a report."""
     try:
         # Importing libraries and reading the scene also take seconds, so the progress display starts here.
         with progress_bars(log()) as progress:
@@ -127,7 +128,7 @@ def run(
 
 
 def _earlier_map_text(out: Path) -> str:
-    """A note if the folder contains a map, which is that of an earlier calibration; empty if it contains none."""
+    """Return a note if the folder contains the map of an earlier calibration; without a map, the text is empty."""
     from calibray.prediction.map_files import FILES
     from calibray.support.output_files import is_unchanged_output
 
@@ -135,13 +136,13 @@ def _earlier_map_text(out: Path) -> str:
     if not files:
         return ""
     return (
-        f"Note: the map in {out} ({', '.join(files)}) is that of an earlier run; draw it again with: "
+        f"Note: the map in {out} ({', '.join(files)}) belongs to an earlier run; draw the map again with: "
         + command("map", out)
     )
 
 
 def _kept_text(out: Path) -> str:
-    """Message that states which results an interrupted run has kept, and how to continue."""
+    """A message that states which results an interrupted run has kept, and how to continue the run."""
     from contextlib import closing, suppress
 
     from calibray.engines import open_ledger
@@ -160,7 +161,7 @@ def _kept_text(out: Path) -> str:
 
 
 def _write_report(result: Result, out: Path, output: Output) -> list[str]:
-    """Write the report next to the result; a failure causes only a warning, because the result is already saved."""
+    """Write the report next to the saved result; if this fails, only a warning is printed."""
     try:
         from calibray.reporting import page
 
@@ -187,13 +188,13 @@ def demo(
         str,
         option(
             "NAME",
-            "replay (trace once) or retrace (run the ray tracer for every candidate, as in the paper).",
+            "Engine: replay (trace once) or retrace (run the ray tracer for every candidate, as in the paper).",
         ),
     ] = "replay",
     seed: Annotated[int, option("N", "Seed of the methods.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run the experiment of the paper in the demo district: tables, figures and a report."""
+    """Run the experiment of the paper in the demo district, and write tables, figures and a report."""
     with progress_bars(log()) as progress:
         from calibray.comparison.demo import FILES, run_demo, write_demo
         from calibray.support.output_files import check_outputs
@@ -216,8 +217,8 @@ def trace(
         bool,
         typer.Option(
             "--check",
-            help="Trace again with twice the samples and a different seed, and show the changes. If the samples are "
-            "'auto', show the changes caused by the last round of rays.",
+            help="Trace again with twice the samples and a different seed, and show by how much path loss changes. If "
+            "trace.samples is 'auto', show the changes that the last round of rays caused.",
         ),
     ] = False,
     *,
@@ -264,14 +265,14 @@ def trace(
 
 
 def _traces(study: StudyModel) -> bool:
-    """Whether the paths of a study come from the ray tracer, rather than from a table or a program."""
+    """Whether the paths of a study come from the ray tracer rather than from a table or an external program."""
     return study.rays_path is None and not study.engine.exports_rays
 
 
 def _trace(
     setup: Setup, out: Path | None, overwrite: bool, trace_again: bool, progress: Progress
 ) -> tuple[Paths, Convergence | None]:
-    """Trace all links together, store the paths, and trace again as a check if requested."""
+    """Trace all links together, store the paths and, if requested, trace again as a check."""
     from functools import partial
 
     from calibray.fields import path_loss
@@ -281,7 +282,7 @@ def _trace(
     study, links = setup.study, setup.links
     if _traces(study) and (announcement := setup.tracer.plan(links).announcement(len(links))):
         echo(announcement, err=True)
-    # `setup.trace` applies the antennas and facades of the study, as in a calibration.
+    # As in a calibration, `setup.trace` applies the antennas and facades of the study.
     paths = setup.trace(progress=progress)
     if out is not None:
         paths.save(out, overwrite)
@@ -307,7 +308,7 @@ def report(
     *,
     permissions: Permissions,
 ) -> None:
-    """Write a result as one HTML file: summary, values, figures, map, and the scene in 3-D."""
+    """Write the report of a result as one HTML file with a summary, values, figures, a map and the scene in 3-D."""
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.engines.ledger.ledger import LEDGER_FILE

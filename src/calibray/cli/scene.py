@@ -29,17 +29,22 @@ Out = Annotated[Path, option("DIR", "Folder for scene.xml and the meshes.", "--o
 
 @dataclass(frozen=True)
 class MapOptions:
-    """Options for scenes with buildings and ground."""
+    """Options for outdoor scenes, which consist of buildings and ground."""
 
     terrain: Annotated[
-        Path | None, option("FILE", "GeoTIFF height model of the ground; by default the ground is level.")
+        Path | None,
+        option("FILE", "GeoTIFF height model of the ground; without this option, the ground is level."),
     ] = None
     spacing: Annotated[
-        float | None, option("M", "Cell width of the ground [m]; by default that of the height model.")
+        float | None,
+        option("M", "Cell width of the ground mesh [m]; by default, the cell width of the height model."),
     ] = None
     origin: Annotated[
         str | None,
-        option("LON,LAT", "Origin of the scene frame [deg]; by default the centre of the buildings."),
+        option(
+            "LON,LAT",
+            "Origin of the scene frame [deg]; by default, the origin is the centre of the buildings.",
+        ),
     ] = None
     utm: Annotated[
         bool,
@@ -48,32 +53,35 @@ class MapOptions:
         ),
     ] = False
     wall: Annotated[
-        str, option("ITU[:M]", "P.2040 material of the walls, with the thickness [m] after a colon.")
+        str, option("ITU[:M]", "P.2040 material of the walls; a colon and the thickness [m] can follow.")
     ] = "concrete:0.3"
     roof: Annotated[
         str,
         option(
             "ITU[:M]",
-            "Material of the roofs. 'wall' combines roofs and walls in one mesh, so that eaves diffract.",
+            "Material of the roofs. 'wall' combines roofs and walls in one mesh, so that rays can diffract at the "
+            "eaves.",
         ),
     ] = "concrete:0.3"
     ground: Annotated[str, option("ITU[:M]", "Material of the ground.")] = "concrete:1.0"
     window_share: Annotated[
-        float, option("SHARE", "Share of every wall that is covered by windows, at least 0 and below 1.")
+        float, option("SHARE", "Share of each wall that windows cover, at least 0 and below 1.")
     ] = 0.0
     storey: Annotated[
         float,
         option(
-            "M", "Height of a storey [m], for buildings for which the map states only the number of storeys."
+            "M",
+            "Height of a storey [m]; used for buildings for which the map states only the number of storeys.",
         ),
     ] = 3.0
     default_height: Annotated[
         float,
         option(
-            "M", "Height of a building for which the map states neither height nor number of storeys [m]."
+            "M",
+            "Height [m] of buildings for which the map states neither the height nor the number of storeys.",
         ),
     ] = 9.0
-    margin: Annotated[float, option("M", "Width of the ground around the buildings [m].")] = 50.0
+    margin: Annotated[float, option("M", "Width of the strip of ground around the buildings [m].")] = 50.0
     per_building: Annotated[
         bool,
         typer.Option(
@@ -85,18 +93,18 @@ class MapOptions:
 
     @property
     def inputs(self) -> list[Path]:
-        """The files named by the options."""
+        """The input files that the options name."""
         return [] if self.terrain is None else [self.terrain]
 
     @property
     def heights(self) -> HeightRule:
-        """The assumed heights of buildings for which the map states none."""
+        """The rule for the heights of buildings for which the map states no height."""
         from calibray.scenes.authoring import HeightRule
 
         return HeightRule(self.storey, self.default_height)
 
     def frame(self) -> Frame | None:
-        """The scene frame with the given origin; None without an origin."""
+        """The scene frame with the given origin; None if no origin is given."""
         from calibray.coordinates import Frame
 
         if self.origin is None:
@@ -114,17 +122,20 @@ class ColumnOptions:
     height: Annotated[
         str | None,
         option(
-            "COLUMN", "Column with the heights above the ground, or a number [m]; not needed with --levels."
+            "COLUMN",
+            "Column that contains the building heights above the ground, or one height for all buildings [m]; not "
+            "needed with --levels.",
         ),
     ] = None
     bottom: Annotated[
         str,
         option(
             "COLUMN",
-            "Column with the heights of the buildings' undersides above the ground, or a number [m].",
+            "Column that contains the heights of the buildings' undersides above the ground, or one height for all "
+            "buildings [m].",
         ),
     ] = "0"
-    levels: Annotated[str | None, option("COLUMN", "Column with the numbers of storeys.")] = None
+    levels: Annotated[str | None, option("COLUMN", "Column that contains the numbers of storeys.")] = None
     name: Annotated[str | None, option("COLUMN", "Column with the names.")] = None
     layer: Annotated[str | None, option("NAME", "Layer of the file.")] = None
 
@@ -136,7 +147,7 @@ def osm(
     out: Out,
     options: MapOptions,
 ) -> None:
-    """Make a scene from the buildings in an OpenStreetMap extract, and write its trees to a file."""
+    """Make a scene from the buildings in an OpenStreetMap extract, and write the trees in the extract to a file."""
     from calibray.scenes.authoring import SCENE_FILES, TREES_FILE, read_openstreetmap, read_trees
     from calibray.support.output_files import check_outputs
 
@@ -175,19 +186,20 @@ def footprints(
 class PlanOptions:
     """Options for scenes from floor plans."""
 
-    height: Annotated[float, option("M", "Height of walls for which the plan states none [m].")] = 3.0
+    height: Annotated[float, option("M", "Height [m] of walls for which the plan states no height.")] = 3.0
     unit: Annotated[
         float | None,
         option(
             "M",
-            "Unit of length of the plan [m], such as 0.001 for mm; by default the unit of the DXF file, or metres.",
+            "Unit of length of the plan [m], such as 0.001 for mm; by default, the unit that a DXF file states, or "
+            "metres.",
         ),
     ] = None
     floor: Annotated[bool, typer.Option(help="Make a floor.")] = True
     ceiling: Annotated[bool, typer.Option(help="Make a ceiling.")] = True
     merge: Annotated[bool, typer.Option(help="Merge two parallel lines into one wall.")] = True
     material: Annotated[
-        list[str] | None, option("TYPE=ITU[:M]", "Material of one type of wall; can be repeated.")
+        list[str] | None, option("TYPE=ITU[:M]", "Material of one type of wall; the option can be repeated.")
     ] = None
     overwrite: Overwrite = False
 
@@ -199,14 +211,14 @@ def plan(
         Path,
         typer.Argument(
             metavar="PLAN",
-            help="CSV file with the columns x0, y0, x1, y1 (or wkt) and type, and optionally thickness, bottom and "
+            help="CSV file with the columns x0, y0, x1, y1 (or wkt) and type and, optionally, thickness, bottom and "
             "height. DXF, GeoJSON and other vector files are also read.",
         ),
     ],
     out: Out,
     options: PlanOptions,
 ) -> None:
-    """Make a scene from a floor plan, with one sheet per wall, door and window."""
+    """Make a scene from a floor plan; each wall, door and window becomes one sheet."""
     from calibray.scenes.authoring import LIDS, SCENE_FILES, make_plan_scene, read_plan
     from calibray.support.output_files import check_outputs
 
@@ -221,7 +233,7 @@ def plan(
 
 
 def _print(made: MadeScene) -> None:
-    """Print the contents of the scene."""
+    """Print the contents of the scene that was made."""
     from calibray.reporting.scene_tables import contents
     from calibray.tables import render
 
@@ -229,7 +241,7 @@ def _print(made: MadeScene) -> None:
 
 
 def _make(read: Callable[[], tuple[Footprints, Frame, Trees | None]], out: Path, options: MapOptions) -> None:
-    """Make a scene from the buildings and trees that `read` returns with their frame, and print its contents."""
+    """Make a scene from the buildings, frame and trees that `read` returns, and print the scene's contents."""
     import numpy as np
 
     from calibray.scenes.authoring import Palette, Windows, lower_origin, make_scene, read_terrain
@@ -268,13 +280,13 @@ def _check_origin(origin: str | None, buildings: Footprints) -> None:
     distance = float(np.abs(buildings.bounds).max())
     if origin is not None and distance > WIDEST:
         raise InputError(
-            f"--origin {origin}: the buildings are {distance / 1000:,.0f} km from it; give longitude first, then "
-            "latitude"
+            f"--origin {origin}: the buildings are {distance / 1000:,.0f} km from this origin; give longitude first, "
+            "then latitude"
         )
 
 
 def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
-    """Materials by wall type, from entries such as `drywall=plasterboard:0.1`."""
+    """Read the material of each wall type from entries such as `drywall=plasterboard:0.1`."""
     from calibray.scenes.authoring import WALL_THICKNESS, material_name
 
     types: dict[str, SurfaceMaterial] = {}
@@ -295,7 +307,7 @@ def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
 
 
 def _material(name: str, text: str, thickness: float) -> SurfaceMaterial:
-    """A material from its P.2040 name and, after a colon, its thickness [m]."""
+    """Read a material from its P.2040 name, which a colon and the thickness [m] can follow."""
     from calibray.scenes.authoring import SurfaceMaterial
 
     itu, colon, own_thickness = text.partition(":")

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Division:
-    """Options for the links that are held out in turn."""
+    """Options that select the links that are held out in turn."""
 
     blocks: Annotated[
         int | None,
         option(
             "N",
-            "Number of blocks, each held out in turn; by default the number in the study, or 4.",
+            "Number of blocks, each of which is held out in turn; by default, the number in the study or else 4.",
             min=2,
             max=100,
         ),
@@ -48,7 +48,7 @@ def validate(
         Path | None,
         option(
             "DIR",
-            "Write the validation into this result folder, so that `calibray report DIR` shows it.",
+            "Result folder into which to write the validation, so that `calibray report DIR` includes it.",
             "--out",
             "-o",
         ),
@@ -58,7 +58,7 @@ def validate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate without each block of links in turn, and compare models on the held-out block."""
+    """Hold out each block of links in turn, calibrate on the other links, and compare models on the held-out block."""
     with progress_bars(log()) as progress:
         from calibray.engines import LEDGER_FILE, open_workers
         from calibray.result.files import RESULT_FILE, VALIDATION_FILE, check_same_study, write_validation
@@ -93,7 +93,7 @@ def validate(
 
 
 def _unused_text(folder: Path, chosen: str) -> str:
-    """A note if the folder has a result whose predictions do not use the chosen model; otherwise empty."""
+    """Return a note if the predictions of the folder's result do not use the chosen model; otherwise, an empty text."""
     from calibray.calibration.result import Result
     from calibray.result.files import RESULT_FILE
     from calibray.result.wording import unused_choice_text
@@ -105,10 +105,10 @@ def _unused_text(folder: Path, chosen: str) -> str:
 
 
 def _check_same_inputs(setup: Setup, folder: Path) -> None:
-    """Refuse a folder whose result was calibrated with another scene or other links, before time is spent.
+    """Before time is spent, refuse a folder whose result was calibrated with another scene or with other links.
 
     Raises:
-        InputError: The links, or a file of the scene or of an antenna, have changed since the calibration.
+        InputError: The links, or a file of the scene or of an antenna, changed since the calibration.
     """
     from calibray.calibration.result import Result
     from calibray.result.files import changed_files, has_links
@@ -119,8 +119,8 @@ def _check_same_inputs(setup: Setup, folder: Path) -> None:
         changed = [*changed, str(setup.links.source)]
     if changed:
         raise InputError(
-            f"{folder}: {', '.join(changed[:5])} changed since its result was calibrated; run the study again, or give "
-            "another folder"
+            f"{folder}: {', '.join(changed[:5])} changed since the result in this folder was calibrated; run the study "
+            "again, or give another folder"
         )
 
 
@@ -129,10 +129,13 @@ class Runs:
     """Options for the runs to compare."""
 
     methods: Annotated[
-        str, option("NAMES", "Methods, separated by commas; METHOD@CALLS sets the budget of one method.")
+        str,
+        option(
+            "NAMES", "Names of the methods, separated by commas; METHOD@CALLS sets the budget of one method."
+        ),
     ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares"
-    seeds: Annotated[int, option("N", "Runs of each method, with seeds 0 to N - 1.")] = 25
-    budget: Annotated[int, option("CALLS", "RT calls per run.")] = 225
+    seeds: Annotated[int, option("N", "Number of runs of each method; the seeds are 0 to N - 1.")] = 25
+    budget: Annotated[int, option("CALLS", "Number of RT calls per run.")] = 225
     workers: Annotated[int, option("N", "Number of local processes.")] = 1
 
 
@@ -146,11 +149,11 @@ def compare(
     runs: Runs,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compare methods on a study, with many seeds, equal budgets of RT calls and replayed paths."""
+    """Compare methods on a study over many seeds, with equal budgets of RT calls and with replayed paths."""
     import os
 
-    # The matrices are small, so BLAS threads cost more than they save; runs are distributed over processes instead.
-    # NumPy reads these variables when it is imported, here and in the workers.
+    # The matrices are small, so BLAS threads cost more time than they save; instead, runs are distributed over
+    # processes. NumPy reads these variables on import, both here and in the workers.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 

@@ -1,4 +1,4 @@
-"""The demo: a coastal high-rise district like the one in the paper, and a simulated measurement campaign.
+"""The demo: a coastal high-rise district like that of the paper, with a simulated measurement campaign.
 
 The folder `coastal_district/` contains its files. In the repository, `python benchmarks/demo_campaign.py FOLDER`
 regenerates them.
