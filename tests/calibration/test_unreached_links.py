@@ -196,7 +196,7 @@ def test_the_colours_of_a_map_end_at_quantiles(shadowed: Result) -> None:
     assert (low, high) == pytest.approx(np.quantile(loss, [0.02, 0.98]), abs=0.01)
     (bar,) = picture.axes[1:]
     assert f"colours: {low:.3g} to {high:.3g} (2 % to 98 % quantile)" in bar.get_ylabel()
-    assert "values outside take the end colours" in bar.get_ylabel()
+    assert "values outside this range have the end colours" in bar.get_ylabel()
     # Neither end of the label is cut off.
     bar.figure.draw_without_rendering()
     label, page = bar.yaxis.label.get_window_extent(), bar.figure.bbox
@@ -234,8 +234,8 @@ def test_the_rate_of_the_calibration_gives_the_cost(
     content["trace"]["samples"] = "auto"
     announce(replace(slow, study=cb.Study.from_content(content, slow.study.path)), 1000, "cells")
     assert said[2] == (
-        "Tracing 1,000 cells: about 17 minutes at the rate of the 17 calibration links, less if they are cached, much "
-        "longer if the calibration read its paths from the cache"
+        "Tracing 1,000 cells: about 17 minutes at the rate of the 17 calibration links, less if the paths are cached, "
+        "much longer if the calibration read its paths from the cache"
     )
 
 

@@ -192,7 +192,7 @@ def test_a_power_in_addition_to_that_in_the_offset_of_rsrp_is_announced(result, 
     shown = cb.coverage_map(rsrp, **arguments)
     assert "RSRP" not in caplog.text
     raised = cb.coverage_map(rsrp, power_dbm=17.0, **arguments)
-    assert "so the map differs from RSRP by +17 dB; leave the power out" in caplog.text
+    assert "so the map differs from RSRP by +17 dB; to map RSRP, omit the power" in caplog.text
     higher = raised.layers["received_power_dbm"] - shown.layers["received_power_dbm"]
     assert higher[np.isfinite(higher)] == pytest.approx(17.0)
 

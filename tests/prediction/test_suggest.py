@@ -306,7 +306,7 @@ def test_links_that_changed_since_the_calibration_are_refused(folder, result, ta
     before = file.read_text()
     try:
         change(pd.read_csv(file)).to_csv(file, index=False)
-        with pytest.raises(InputError, match=r"links\.csv: its links changed since the calibration"):
+        with pytest.raises(InputError, match=r"links\.csv: the links changed since the calibration"):
             cb.suggest(result, table)
         if len(pd.read_csv(file)) < len(result.links):
             with pytest.raises(InputError, match="has 13 links, but 14 were calibrated"):
@@ -319,7 +319,10 @@ def test_fewer_candidates_than_requested_are_counted_in_a_warning(result, table,
     assert len(cb.suggest(result, table.iloc[:2], 2)) == 2
     assert "suggestions instead" not in caplog.text
     assert len(cb.suggest(result, table.iloc[:2], 10)) == 2
-    assert "2 suggestions instead of 10: only 2 of 2 candidates have a path and enough power" in caplog.text
+    assert (
+        "fewer suggestions (2) than requested (10): only 2 of 2 candidates have a path and enough power"
+        in caplog.text
+    )
 
 
 @pytest.mark.parametrize("above_db", [1.0, 6.0])
@@ -344,7 +347,7 @@ def test_candidates_as_near_the_noise_floor_as_the_calibration_leaves_out_are_le
     assert (every.path_loss_db >= -floor).sum() < weak.sum() < len(table)
     assert set(cb.suggest(powers, table, len(table)).row) == set(every.row[~weak])
     reason = f"less than {margin:.1f} dB above links.noise_floor_dbm = {floor:g}, and the calibration uses no"
-    assert f"{weak.sum()} of 25 candidates are left out: their predicted power is {reason}" in caplog.text
+    assert f"{weak.sum()} of 25 candidates left out, because the predicted power is {reason}" in caplog.text
     with pytest.raises(
         InputError, match=rf"all {weak.sum()} candidates .* is less than {margin:.1f} dB above"
     ):

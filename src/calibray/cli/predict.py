@@ -398,7 +398,8 @@ def map(
     predicted, without_path = int(np.isfinite(coverage.path_loss_db).sum()), int(coverage.no_path.sum())
     echo(
         f"{coverage.z.size:,} cells: {predicted - without_path:,} predicted by the model, {without_path:,} without a "
-        f"path by the log-distance model (hatched), {coverage.z.size - predicted:,} blank (inside buildings)",
+        f"path and predicted by the log-distance model (hatched), {coverage.z.size - predicted:,} blank (inside "
+        "buildings)",
         err=True,
     )
     if len(names) < len(FILES):

@@ -1,1 +1,1 @@
-"""Prediction: path loss at new links, coverage maps, and suggestions of where to measure next."""
+"""Prediction: path loss of new links, coverage maps, and suggestions of where to measure next."""

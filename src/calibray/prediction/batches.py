@@ -1,4 +1,4 @@
-"""Predictions of many links with bounded memory: batch by batch, and in chunks on workers that return no paths."""
+"""Predict many links with bounded memory, batch by batch, and in chunks on workers that do not return paths."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from calibray.support.progress import Progress, with_total
 from calibray.tracing.trace_plan import LANES_PER_SECOND
 
 BATCH: Final = 10_000
-"""Largest number of links that are traced and evaluated together."""
+"""Maximum number of links that are traced and evaluated together."""
 
 DIFFUSE_BATCH: Final = 50
-"""Largest number of links that are traced together with diffuse reflection, which finds tens of thousands of paths per
-link."""
+"""Maximum number of links that are traced together if diffuse reflection is on, because it yields tens of thousands of
+paths per link."""
 
 CHUNKS_PER_BATCH: Final = 100
-"""Number of chunks that are sent to the workers together."""
+"""Number of chunks that are sent to the workers at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class _Task:
 
 
 def batch_size(setup: Setup, workers: Workers | None) -> int:
-    """Number of links to predict together; it keeps memory use independent of the total number of links."""
+    """Number of links to predict together; with this limit, memory use does not depend on the total number of links."""
     if workers is not None:
         return CHUNKS_PER_BATCH * _chunk_size(setup)
     return DIFFUSE_BATCH if setup.study.trace.diffuse_reflection else BATCH
@@ -68,11 +68,11 @@ def predict_links(
 ) -> pd.DataFrame:
     """Predict path loss, intervals and remarks, in this process or on workers.
 
-    The result is the table of `interval` with a column `remark`, which is empty for links without a remark, and for all
-    links if `with_remarks` is False. The stage of `progress` is "tracing".
+    The result is the table that `interval` returns, with a further column `remark`. This column is empty for links
+    without a remark and, if `with_remarks` is False, for all links. `progress` is called with the stage "tracing".
 
     Raises:
-        InputError: `interval` refuses the input.
+        InputError: `interval` rejects the input.
         EngineError: The paths do not fit into memory, or workers fail repeatedly.
     """
     links = setup.links
@@ -80,7 +80,7 @@ def predict_links(
         workers = InProcess(at_most=0)
     if workers is None:
         return _predict_chunk(_Task(result, setup, level, with_remarks), links, progress)
-    # Predictions need neither the history nor the paths, so these are not sent to the workers.
+    # Predictions need neither the history nor the paths, so neither is sent to the workers.
     light = replace(result, history=result.history.iloc[:0], paths=None, scene=None)
     task = _Task(light, setup.at(select_links(links, np.array([0]))), level, with_remarks)
     chunks = for_each_chunk(workers, _predict_chunk, task, links, _chunk_size(setup), progress)
@@ -99,13 +99,13 @@ def predict_batches(
     *,
     allow_changed_inputs: bool = False,
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
-    """Predict the links of a table batch by batch, so that memory use does not grow with their number.
+    """Predict the links of a table batch by batch, so that memory use does not grow with the number of links.
 
-    All rows are checked before the first link is traced. The table has the columns that `predict` reads. The stages of
-    `progress` are "checking" and "tracing".
+    All rows are checked before the first link is traced. The table must have the columns that `predict` reads.
+    `progress` is called with the stages "checking" and "tracing".
 
     Yields:
-        Links and their predictions, as returned by `predict_links`, in the order of the table.
+        Links with their predictions, as `predict_links` returns them, in the order of the table.
 
     Raises:
         InputError: See `predict` and `predict_interval`.
@@ -156,11 +156,11 @@ def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None =
 
 
 LOG: Final = logging.getLogger(__name__)
-"""Logs the expected cost before the work starts; the command line prints it."""
+"""Logger for the expected cost, which is logged before the work starts and printed by the command line."""
 
 
 def announce(result: Record, links: int, what: str = "links") -> None:
-    """Log the number of links to trace and the approximate duration."""
+    """Log the number of links to trace and the approximate duration of the trace."""
     counted = f"{links:,} {what.removesuffix('s') if links == 1 else what}"
     if result.prediction.model.parameters is None:
         LOG.info("%s, predicted without a trace: the log-distance model uses no scene", counted)
@@ -175,7 +175,7 @@ def announce(result: Record, links: int, what: str = "links") -> None:
     adaptive = result.study.trace.adaptive
     most = f"{'' if adaptive else 'up to '}about {duration(seconds)}"
     LOG.info(
-        "Tracing %s: %s at the rate of the %s calibration links, less if they are cached%s",
+        "Tracing %s: %s at the rate of the %s calibration links, less if the paths are cached%s",
         counted, most if seconds >= 2 else "less than 2 seconds", f"{calibrated:,}",
         ", much longer if the calibration read its paths from the cache" if adaptive else "",
     )  # fmt: skip
@@ -184,8 +184,8 @@ def announce(result: Record, links: int, what: str = "links") -> None:
 def _seconds(result: Record, links: int) -> float:
     """Estimated duration of a trace [s].
 
-    The calibration may have read its trace from the cache, so an estimate from the number of rays is a lower limit. If
-    rays are added until path loss converges, their number is unknown.
+    If the calibration read its trace from the cache, its tracing time is too short, so the estimate is at least that
+    from the number of rays. If rays are added until path loss converges, the number of rays is not known in advance.
     """
     settings = result.study.trace
     lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links

@@ -1,12 +1,13 @@
-"""Corrections of the modelled path loss of new links: nuisance, residual field, and the fallback for a missing path.
+"""Corrections to the modelled path loss of new links: nuisance, residual field, and fallback for a missing path.
 
-The nuisance is uncertain for groups without measurements. A link without a path is predicted by the log-distance model,
-with the interval of that model, and the prediction is marked.
+The nuisance is uncertain for groups without measurements. For a link without a path, the log-distance model provides
+the path loss and the interval, and the prediction is marked.
 
-The residual field is the correlated part of the calibration residuals, kriged to nearby links. Clutter that the scene
-lacks affects neighbouring links in the same way, so the residual near a measured link is partly known. The correlated
-part has an exponential covariance. Its range and variance maximize the restricted likelihood
-(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the kriged field is zero.
+The residual field is the spatially correlated part of the calibration residuals, kriged to nearby links. Clutter that
+is missing from the scene affects neighbouring links in the same way, so the residual near a measured link is partly
+known. The correlated part has an exponential covariance. The range and variance of this covariance maximize the
+restricted likelihood (`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the kriged
+field is zero.
 """
 
 from __future__ import annotations
@@ -33,26 +34,27 @@ from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import without_scene
 
 MOST_EXACT: Final = 1000
-"""Largest number of measured links that are all used at every new link; if there are more, only the nearest links are
-used."""
+"""Maximum number of measured links for which kriging uses all of them at every new link; with more measured links, only
+the nearest are used."""
 
 NEAREST: Final = 50
-"""Number of nearest measured links used at each new link."""
+"""Number of nearest measured links that kriging uses at each new link."""
 
 TOGETHER: Final = 500
-"""Number of new links for which the kriging equations are solved together; each link requires about 150 kB."""
+"""Number of new links for which the kriging equations are solved together; each link needs about 150 kB of memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class TermAtLinks:
-    """A fitted nuisance term at new links.
+    """A fitted nuisance term, evaluated at new links.
 
     Attributes:
         name: Name of the term.
-        column: Values of the term's column, minus its centre [links].
+        column: Values of the term's column minus the term's centre [links].
         labels: Labels of the links' groups [links]; None for a term without groups.
         coefficients: Coefficient by group, [dB] per unit of the column.
-        spread_db: Standard deviation between groups, in the same unit; if None, that of the coefficients is used.
+        spread_db: Standard deviation between groups, in the unit of the coefficients; if None, the standard deviation
+            of the coefficients is used.
     """
 
     name: str
@@ -66,8 +68,10 @@ class Shift(NamedTuple):
     """The contribution of the nuisance to path loss.
 
     Attributes:
-        value_db: Contribution with the best coefficients, then with each draw [1 + draws, links], [dB].
-        spread_db: Standard deviation at links whose group has no coefficient; 0 at other links [links], [dB].
+        value_db: Contribution with the best coefficients, followed by the contribution with each draw [1 + draws,
+            links], [dB].
+        spread_db: Standard deviation of the contribution for links whose group has no coefficient; 0 for other links
+            [links], [dB].
     """
 
     value_db: NDArray[np.float64]
@@ -75,16 +79,17 @@ class Shift(NamedTuple):
 
 
 def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
-    """Terms of the prediction model at new links.
+    """Evaluate the nuisance terms of the prediction model at new links.
 
     Yields:
-        The terms, each with its column and the groups of the links.
+        Each term with the values of its column and the groups of the links.
 
     Raises:
         InputError: The links lack a column.
     """
     for term in model.terms:
-        # The name of the term decides, because a column of the study may be called "transmitter" or "offset".
+        # The name of the term determines the labels, because a column of the study may be called "transmitter" or
+        # "offset".
         if not term.per:
             labels = None
         elif term.name == TX_OFFSET:
@@ -102,12 +107,12 @@ def nuisance_shift(
     *,
     new_groups: bool = False,
 ) -> Shift:
-    """The contribution of nuisance terms to the path loss of new links.
+    """Compute the contribution of nuisance terms to the path loss of new links.
 
-    A group without a coefficient is assigned the mean of the n coefficients. Its spread is the standard deviation s
-    between groups, enlarged by the uncertainty of the mean: s sqrt(1 + 1 / n). With `new_groups`, such groups are also
-    allowed in terms without an estimated spread. New transmitters are always allowed, because no column names them.
-    `draws` contains posterior draws by coefficient.
+    A group without a coefficient is assigned the mean of the n coefficients. For such a group, the standard deviation s
+    between groups is enlarged by the uncertainty of the mean, to s sqrt(1 + 1 / n). With `new_groups`, groups without a
+    coefficient are also allowed in terms without an estimated spread. New transmitters are always allowed, because no
+    column identifies transmitters. `draws` contains posterior draws by coefficient.
 
     Raises:
         InputError: A group has no coefficient, and `new_groups` is False.
@@ -119,7 +124,7 @@ def nuisance_shift(
         best = np.array(list(term.coefficients.values()))
         columns = []
         for label, coefficient in term.coefficients.items():
-            # A random effect is drawn as a mean and the deviations of the groups from it.
+            # The draws of a random effect consist of a mean and the deviations of the groups from this mean.
             effect = (term.name, f"{deviations_of(term.name)}[{label}]")
             names = (f"{term.name}[{label}]" if label else term.name,) if term.spread_db is None else effect
             drawn = np.full(num_draws, coefficient)
@@ -134,8 +139,8 @@ def nuisance_shift(
             new_label = str(labels[int(np.argmax(group < 0))])
             raise InputError(
                 f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "
-                f"{', '.join(term.coefficients)}; with an interval (--level, predict_interval), the mean is used for "
-                "new groups"
+                f"{', '.join(term.coefficients)}; to use the mean for new groups, request an interval (--level, "
+                "predict_interval)"
             )
         mean = coefficients.mean(axis=1, keepdims=True)
         value += term.column * np.where(group >= 0, coefficients[:, group], mean)
@@ -154,7 +159,7 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Fill a table of predictions with those of the fallback for links without a path.
+    """Fill in a table of predictions for links without a path, using the fallback model.
 
     The columns are path_loss_db (infinite without a path), basis and, with a level, lower_db and upper_db. `least_db`
     is half the width of the prediction model's interval [links], [dB]; the fallback's interval is at least as wide.
@@ -178,7 +183,7 @@ def fill_missing(
     filled.loc[missing, "basis"] = np.where(shift.spread_db > 0, f"{basis}, {NEW_GROUP}", basis)
     half_width = np.broadcast_to(least_db, len(links))[missing]
     if model.residual_db:
-        # A group without a coefficient adds its spread to the errors of the fallback.
+        # For a group without a coefficient, the spread between groups adds to the errors of the fallback.
         errors_db = interval_half_width(np.array(model.sizes_db), level)
         half_width = np.maximum(half_width, errors_db * np.hypot(1.0, shift.spread_db / model.residual_db))
     filled.loc[missing, "lower_db"] = path_loss_db - half_width
@@ -192,11 +197,11 @@ def krige_residuals(
     residuals: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Krige the residual field from measured links to new links, given the positions of both ends [m, 6], [n, 6], [m].
+    """Krige the residual field from measured links to new links; positions are those of both ends [m, 6], [n, 6], [m].
 
-    Residuals are measured minus modelled path loss [m], [dB]. The results are the correction of the modelled path loss
-    [n], [dB], and the share of the field's variance that the measured links explain [n]. This share is 0 far from all
-    measured links, and less than 1 near a measured link.
+    A residual is the measured minus the modelled path loss [m], [dB]. The results are the correction of the modelled
+    path loss [n], [dB], and the share of the field's variance that the measured links explain [n]. This share is 0 far
+    from all measured links, and less than 1 near a measured link.
     """
     if len(measured) <= MOST_EXACT:
         return _krige(field, measured, residuals, position)
@@ -223,7 +228,7 @@ def _krige(
     residuals: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Simple kriging with an exponential covariance: c^T K^-1 r, and c^T K^-1 c over the field's variance."""
+    """Simple kriging with an exponential covariance: c^T K^-1 r, and c^T K^-1 c divided by the field's variance."""
     variance = field.shared_db**2
     covariance = variance * np.exp(-cdist(measured, measured) / field.range_m)
     covariance = covariance + field.own_db**2 * np.eye(len(measured))
@@ -234,7 +239,7 @@ def _krige(
 
 
 def calibration_residuals(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows of the calibration links with a path [m], and their measured minus predicted path loss [m], [dB]."""
+    """Find the calibration links with a path [m], and their measured minus predicted path loss [m], [dB]."""
     modelled = links["predicted_db"].to_numpy(float)
     counted = links["has_path"].to_numpy(bool) & ~links["held_out"].to_numpy(bool) & np.isfinite(modelled)
     if "faint" in links:

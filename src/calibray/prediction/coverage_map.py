@@ -1,8 +1,8 @@
-"""Coverage maps: path loss over an area, predicted with the calibrated scene, and its interval.
+"""Coverage maps: path loss over an area, predicted with the calibrated scene, with prediction intervals.
 
-The link to the centre of each cell is predicted like any other link. Sionna's radio map solver instead averages over
-the rays that cross each cell. In the demo district, the two differ by more than 0.05 dB in 70 % of the cells, and by
-more than 0.7 dB in 10 % of them (`python benchmarks/coverage_map.py --solver`).
+Path loss to the centre of each cell is predicted as for any other link. Sionna's radio map solver instead averages over
+the rays that cross each cell. In the demo district, the two methods differ by more than 0.05 dB in 70 % of the cells,
+and by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
 """
 
 from __future__ import annotations
@@ -59,30 +59,33 @@ def coverage_map(
     workers: Workers | None = None,
     allow_changed_inputs: bool = False,
 ) -> CoverageMap:
-    """Predict path loss over an area, with an interval for a measurement there.
+    """Predict path loss over an area, with an interval for a measurement in each cell.
 
     Args:
         result: The calibration.
-        tx: Position of the transmitter [3], [m]; if None, that of the only transmitter of the calibration.
-        height: Height of the receivers above the ground or, where there is no ground, above the scene's lowest point
-            [m].
+        tx: Position of the transmitter [3], [m]; if None, the position of the calibration's only transmitter.
+        height: Height of the receivers above the ground or, where the scene has no ground, above the scene's lowest
+            point [m].
         cell: Width of the cells [m]; the receivers are at their centres.
-        bounds: West, south, east and north bounds of the area [4], [m]; if None, those of the scene.
+        bounds: West, south, east and north bounds of the area [4], [m]; if None, the bounds of the scene.
         level: Probability that the interval contains a measurement; None for no interval.
-        power_dbm: Transmitted power for a map of received power [dBm]; if None, the map shows path loss. After a
+        power_dbm: Transmitted power, for a map of received power [dBm]; if None, the map shows path loss. After a
             calibration on RSRP, the default is 0, because the offset contains the power.
-        samples: Number of rays; if None, that of the study. With too few rays, paths are missing; the time taken is
-            proportional to the number of rays. "auto" adds rays until path loss has converged, which takes less time
-            than a large number of rays from the start.
-        columns: Values of the study's columns of groups, carriers or nuisances for this transmitter, by column name.
-            The group of an offset is taken from the links measured at this transmitter, if they share a group.
-        progress: Called with the stage "tracing" after every launch.
-        workers: Workers that trace and predict chunks of cells (`engines.open_workers`); this process if None.
-        allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
+        samples: Number of rays; if None, the number in the study. Too few rays miss paths; the computing time is
+            proportional to the number of rays. "auto" adds rays until path loss converges, which is faster than using a
+            large number of rays from the start.
+        columns: Values, for this transmitter, of the study's columns for groups, carriers or nuisances, by column name.
+            The offset group is taken from the links measured at this transmitter if these links all belong to the same
+            group.
+        progress: Function that is called with the stage "tracing" after every launch of rays.
+        workers: Workers that trace and predict chunks of cells (see `engines.open_workers`); if None, this process does
+            the work.
+        allow_changed_inputs: If True, predict even if a file of the scene or an antenna has changed since the
+            calibration.
 
     Raises:
-        InputError: An argument is invalid, a column is missing, there would be more than a million cells, or
-            `Result.predict_interval` refuses the links.
+        InputError: An argument is invalid, a column is missing, the map would have more than a million cells, or
+            `Result.predict_interval` rejects the links.
         EngineError: The paths do not fit into memory.
     """
     check_record(result)
@@ -107,10 +110,10 @@ def coverage_map(
     if power_dbm and study.links.quantity == "rsrp":
         _LOG.warning(
             "power %g dBm: after a calibration on RSRP, the offset contains the transmitted power, so the map differs "
-            "from RSRP by %+g dB; leave the power out for RSRP", power_dbm, power_dbm,
+            "from RSRP by %+g dB; to map RSRP, omit the power", power_dbm, power_dbm,
         )  # fmt: skip
     frame = known_frame(study)
-    # Before the grid is known, the study is opened with one link: to a receiver 1 m above the transmitter.
+    # Before the grid is known, the study is opened with a single link, to a receiver 1 m above the transmitter.
     one_link = pd.DataFrame({**position_columns(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
     setup = open_for_links(result, as_links(result, one_link), allow_changed_inputs=allow_changed_inputs)
     triangles = read_triangles(setup.scene)
@@ -129,7 +132,7 @@ def coverage_map(
                 beyond,
                 len(rx),
             )
-    # Cells at the transmitter itself have no path loss.
+    # In cells at the transmitter itself, path loss is undefined.
     cells = np.flatnonzero(np.linalg.norm(rx - transmitter, axis=1) > MIN_DISTANCE)
     names = ("path_loss_db",) if level is None else ("path_loss_db", "lower_db", "upper_db")
     layers, no_path = np.full((3, len(rx)), np.nan), np.zeros(len(rx), dtype=bool)
@@ -164,7 +167,7 @@ def coverage_map(
 
 
 def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float64]:
-    """The given position of the transmitter, or that of the calibration's only transmitter [3], [m]."""
+    """The given transmitter position or, if none is given, that of the calibration's only transmitter [3], [m]."""
     if tx is not None:
         position = _numbers(tx)
         if position.shape != (3,) or not np.isfinite(position).all():
@@ -185,7 +188,7 @@ def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float
 def _column_values(
     result: Record, tx: NDArray[np.float64], columns: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of the study's columns by name; they are the same for every link from this transmitter."""
+    """Values of the study's columns by name; each value applies to every link from this transmitter."""
     if not isinstance(columns, Mapping):
         raise InputError(f"columns = {columns!r}: must be a dictionary with a value for each column")
     study, values = result.study, dict(columns)
@@ -222,7 +225,7 @@ def _column_values(
 def _measured_values(
     study: Study, tx: NDArray[np.float64], columns: Sequence[str], stated: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of columns, such as antennas and carriers, for which all links measured at this transmitter agree."""
+    """Values of columns, such as antennas and carriers, that all links measured at this transmitter have in common."""
     if not set(columns) - set(stated):
         return {}
     links = study.measurements()
@@ -270,7 +273,7 @@ def _grid(
 
 
 def _numbers(values: Sequence[float]) -> NDArray[np.float64]:
-    """The values as numbers [n]; one NaN if they are not numbers."""
+    """Convert values to numbers [n]; if a value is not a number, the result is a single NaN."""
     try:
         return np.array(values, dtype=float).reshape(-1)
     except (TypeError, ValueError):

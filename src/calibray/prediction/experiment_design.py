@@ -1,27 +1,28 @@
-"""Design of the next measurements: candidates ranked by the uncertainty expected after measuring them.
+"""Design of the next measurements: candidates are ranked by the uncertainty expected after they are measured.
 
-The posterior draws represent the possible values. Each draw in turn is assumed to be the true value, and the other
-draws are weighted by their agreement with the measurement that this value would produce. A candidate is ranked by the
-mean logarithm of the remaining standard deviations over draws and parameters (an A-optimal design in relative units,
-averaged over the posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science
-10, 1995). The standard deviations are computed in two ways, and their logarithms are added:
+The posterior draws represent the possible parameter values. Each draw in turn is assumed to be the true value, and the
+other draws are weighted by how well they agree with the measurement that this value would produce. A candidate is
+ranked by the mean logarithm of the remaining standard deviations over draws and parameters (an A-optimal design in
+relative units, averaged over the posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review,
+Statistical Science 10, 1995). The standard deviations are computed in two ways, and their logarithms are added:
 
 - from the scatter of the weighted draws, which distinguishes separate minima but resolves a parameter only relative to
   its whole range;
-- from the curvature at each draw, which shows how much a single minimum narrows.
+- from the curvature at each draw, which shows by how much a measurement narrows a single minimum.
 
-The scatter is uninformative if a range of a parameter contains few draws. If separate ranges of a parameter fit, the
-probability of ruling out all but one of them is therefore added to the rank. In each range, there are values that
-explain the links measured so far. The excess of a value is its sum of squares minus that of the best value. At a
-candidate, the squared difference from the true value is added to this excess. The smallest total in a range is the sum
-of squares that a fit would reach there with all other parameters free. A range is ruled out if its smallest total
-exceeds that of the true range by the quantile of an interval. For two models, this is the T-optimal design (A. C.
-Atkinson and V. V. Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975)
-with an expectation over the true value (G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
-Technometrics 9, 1967).
+The scatter is uninformative if a range of a parameter contains few draws. If several separate ranges of a parameter fit
+the links, the probability of ruling out all but one of these ranges is therefore added to the rank. Each range contains
+values that explain the links measured so far. The excess of a value is its sum of squares minus that of the best value.
+At a candidate, the squared difference from the true value is added to this excess. The smallest total in a range is the
+sum of squares that a fit within this range would reach with all other parameters free. A range is ruled out if its
+smallest total exceeds that of the true range by more than the quantile used for intervals. For two models, this
+criterion is the T-optimal design (A. C. Atkinson and V. V. Fedorov, The design of experiments for discriminating
+between two rival models, Biometrika 62, 1975) with an expectation over the true value (G. E. P. Box and W. J. Hill,
+Discrimination among mechanistic models, Technometrics 9, 1967).
 
-Candidates are chosen one at a time. Part of their errors is common because of an unknown offset or shared clutter.
-Conditioning after each choice removes this part, so a second measurement at the same point adds less information.
+Candidates are chosen one at a time. Part of the error is common to several candidates, because of an unknown offset or
+shared clutter. Conditioning after each choice removes this common part, so a second measurement at the same point adds
+less information.
 """
 
 from __future__ import annotations
@@ -35,34 +36,36 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 UNIFORM_INFORMATION: Final = 12.0
-"""Inverse variance of the uniform distribution over the unit interval: the information before any link is measured."""
+"""Inverse variance of the uniform distribution over the unit interval, which is the information before any
+measurement."""
 
 LEAST_VARIANCE: Final = 1e-5
 """Variance in the unit cube that the scatter of about a hundred draws cannot resolve."""
 
 SEPARATION_WEIGHT: Final = 8.0
-"""Weight of ruling out all ranges of a parameter but one, relative to narrowing the parameter by a factor of e."""
+"""Weight of ruling out all but one range of a parameter, relative to narrowing the parameter by a factor of e."""
 
 RULED_OUT: Final = 4.3
 """Excess of the sum of squares, in noise variances, above which a range is ruled out: F(0.95; 1, about 20)."""
 
 EXCESS_DEVIATION: Final = 3.0
-"""Standard deviation of the excess due to the noise of the candidates' measurements, in noise variances."""
+"""Standard deviation of the excess that the noise of the candidates' measurements causes, in noise variances."""
 
 BATCH: Final = 4_000_000
-"""Largest number of values per batch (draws times values times candidates), which limits memory use."""
+"""Maximum number of values per batch (draws times values times candidates); it limits memory use."""
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Expected errors of the candidates' measurements, for given parameters.
+    """Expected errors of the candidates' measurements if the parameters are known.
 
     Attributes:
-        own_db: Standard deviation of the uncorrelated part of each candidate's error [dB].
+        own_db: Standard deviation of the part of a candidate's error that is independent of other candidates [dB].
         common: Effect of one standard deviation of each common unknown [candidates, unknowns], [dB].
         position: Positions of the receivers, or of both ends [candidates, k], [m].
-        shared_db: Standard deviation of the part of the error that neighbouring candidates share [dB]; 0 for none.
-        range_m: Distance at which the correlation of this part has fallen to 1/e [m].
+        shared_db: Standard deviation of the part of the error that neighbouring candidates share [dB]; 0 if they share
+            none.
+        range_m: Distance at which the correlation of the shared part has fallen to 1/e [m].
     """
 
     own_db: float
@@ -94,8 +97,8 @@ class Outlook:
         index: The candidate.
         narrowed: Standard deviation of every parameter relative to its value before any candidate is measured [d]; at
             most 1.
-        range_probability: Probability that the separate range in which a parameter lies is known [d]; 1 if there is
-            only one range.
+        range_probability: Probability that it is known in which of its separate ranges a parameter lies [d]; 1 if there
+            is only one range.
         information: Information matrix of all links measured up to this candidate, at every draw [n, d, d].
     """
 
@@ -112,7 +115,7 @@ class Beliefs:
     Attributes:
         point: Draws from the posterior in the unit cube [n, d].
         information: Information matrix of the links measured so far, at every draw [n, d, d].
-        piece: Index of the separate range in which each parameter lies [m, d]: first for the draws, then for further
+        piece: Index of the separate range in which each parameter lies [m, d], first for the draws, then for further
             values that explain the links measured so far.
         excess: Sum of squares of each draw and further value minus the smallest sum, in noise variances [m].
     """
@@ -126,19 +129,19 @@ class Beliefs:
 def choose_candidates(
     beliefs: Beliefs, predicted: NDArray[np.float64], slope: NDArray[np.float64], errors: Errors, count: int
 ) -> list[Outlook]:
-    """Choose candidates one at a time.
+    """Choose the candidates to measure, one at a time.
 
     Args:
         beliefs: The state of the calibration.
-        predicted: Path loss of the candidates for every draw and further value [m, candidates], [dB].
-        slope: Derivatives of path loss with respect to the unit cube's coordinates, for the draws [n, candidates, d],
-            [dB].
+        predicted: Path loss of the candidates for each draw and each further value [m, candidates], [dB].
+        slope: Derivatives of path loss with respect to the coordinates of the unit cube, at the draws [n, candidates,
+            d], [dB].
         errors: Expected errors of the measurements.
         count: Number of candidates to choose.
 
     Returns:
-        The candidates in the order of their choice, each with the uncertainty expected after measuring this and the
-        earlier candidates.
+        The candidates in the order in which they are chosen, each with the uncertainty expected after measuring this
+        candidate and the earlier ones.
     """
     prior_information = UNIFORM_INFORMATION * np.eye(beliefs.point.shape[1])
     beliefs = replace(beliefs, information=beliefs.information + prior_information)
@@ -149,7 +152,8 @@ def choose_candidates(
     taken = np.zeros(len(variance), dtype=bool)
     conditioned, outlooks = np.zeros((0, len(variance))), []
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
-    # If draws scatter less than the curvature implies, a prior that the information does not contain narrows them.
+    # If draws scatter less than the curvature implies, a prior narrows them that the information matrices do not
+    # include.
     scale = np.minimum(before / _by_curvature(beliefs.information), 1.0)
     narrowed = np.ones(len(before))
     for _ in range(min(count, len(variance))):
@@ -173,11 +177,12 @@ def choose_candidates(
         slope -= best_slope[:, None, :] * share[:, None]
         variance = np.maximum(variance - share**2, 1e-6 * errors.own_db**2)
         conditioned = np.vstack([conditioned, share])
-        # Where only the true draw keeps its weight, scatter is too small, and curvature gives the remaining deviation.
+        # Where only the true draw keeps its weight, the scatter is too small, so the curvature gives the remaining
+        # deviation.
         left = np.maximum(
             _scatter(beliefs.point, squares[:, :draws]), scale * _by_curvature(beliefs.information)
         )
-        # A measurement removes no information, but the computed scatter of a hundred draws can still grow.
+        # A measurement never removes information, but the computed scatter of a hundred draws can still increase.
         narrowed = np.minimum(left / before, narrowed)
         probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
         outlooks.append(Outlook(best, narrowed, probability, beliefs.information))
@@ -198,13 +203,13 @@ def separation_probability(
     squares: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Probability of ruling out all ranges of a parameter but one, after a candidate is measured [candidates].
+    """Probability of ruling out all but one range of a parameter by measuring a candidate [candidates].
 
     The probability is averaged over draws and parameters; a parameter with a single range contributes 0. `excess` is
     the sum of squares of every value minus the smallest sum, in noise variances [m]; the first n values are the draws.
-    `piece` is the index of each parameter's range [m, d]. `squares` are squared differences between draws and values at
-    the candidates chosen so far [n, m]. `predicted` is the candidates' path loss for every value, in standard
-    deviations of their errors [m, candidates].
+    `piece` is the index of each parameter's range [m, d]. `squares` contains squared differences between draws and
+    values at the candidates chosen so far [n, m]. `predicted` is the path loss of the candidates for every value, in
+    standard deviations of their errors [m, candidates].
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]
@@ -220,7 +225,7 @@ def separation_probability(
 
 
 def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Probability that all ranges are ruled out except that of the true draw [n, c], from sums of squares [n, m, c]."""
+    """Probability that all ranges but that of the true draw are ruled out [n, c], given sums of squares [n, m, c]."""
     ranges, value_range = np.unique(piece, return_inverse=True)
     # The sum of squares of the best fit in each range.
     least = np.stack([total[:, value_range == k].min(axis=1) for k in range(len(ranges))])
@@ -239,7 +244,7 @@ def _rank_by_scatter(
     for start in range(0, candidates, size):
         batch = predicted[:, start : start + size].T
         weight = _weights(squares + (batch[:, :, None] - batch[:, None, :]) ** 2)
-        # Moments of the draws if the draw of each row is the truth.
+        # Moments of the draws, assuming that the draw of each row is the true value.
         mean = weight @ point
         variance = np.maximum(weight @ point**2 - mean**2, 0.0)
         rank[start : start + size] = 0.5 * np.log(variance + LEAST_VARIANCE).mean(axis=(1, 2))
@@ -247,9 +252,9 @@ def _rank_by_scatter(
 
 
 def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean logarithm of the standard deviations from curvature after a candidate is measured [candidates]."""
+    """Mean logarithm of the standard deviations implied by curvature, after a candidate is measured [candidates]."""
     covariance = np.linalg.inv(information)
-    # Sherman-Morrison: the inverse after adding one row of slopes.
+    # The Sherman-Morrison formula gives the inverse after one row of slopes is added.
     gain = slope @ covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2)[:, None] - gain**2 / (
         1.0 + np.sum(gain * slope, axis=2, keepdims=True)
@@ -258,14 +263,14 @@ def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float
 
 
 def _scatter(point: NDArray[np.float64], squares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected standard deviation of every parameter [d]."""
+    """Expected standard deviation of every parameter [d], from the scatter of the weighted draws."""
     weight = _weights(squares)
     variance = weight @ point**2 - (weight @ point) ** 2
     return np.sqrt(np.maximum(variance, 0.0)).mean(axis=0)
 
 
 def _by_curvature(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected standard deviation of every parameter from the information matrices at the draws [d]."""
+    """Expected standard deviation of every parameter [d], from the information matrices at the draws."""
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)).mean(axis=0)
 
 

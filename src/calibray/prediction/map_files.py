@@ -1,4 +1,4 @@
-"""A coverage map and its files: GeoTIFF, picture and table."""
+"""A coverage map and the files that it is written to: GeoTIFF, picture and table."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ GEOTIFF, PICTURE, TABLE = FILES
 LOSS_COLORS: Final = "viridis_r"
 POWER_COLORS: Final = "viridis"
 WIDTH_COLORS: Final = "cividis"
-"""Matplotlib colour scales with an order that is clear to colour-blind readers and in greyscale; strong signals are
-bright."""
+"""Matplotlib colour scales whose order is clear to colour-blind readers and in greyscale; strong signals are bright."""
 
 QUANTILES: Final = (0.02, 0.98)
-"""Quantiles of the cells' values at which the colour scale ends, so that a few extreme values do not compress it."""
+"""Quantiles of the cells' values at which the colour scale ends, so that a few extreme values do not compress the
+scale."""
 
 
 @final
@@ -51,16 +51,17 @@ class CoverageMap:
         x: Eastings of the cells' centres, ascending [nx], [m].
         y: Northings of the cells' centres, ascending [ny], [m].
         z: Heights of the receivers [ny, nx], [m].
-        path_loss_db: Path loss with nuisances [ny, nx], [dB]; for cells without a path, from the log-distance model.
-            NaN at the transmitter and, in an outdoor study, for cells inside buildings that have no path.
-        lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a prediction or without a level.
+        path_loss_db: Path loss with nuisances [ny, nx], [dB]; in cells without a path, the prediction of the
+            log-distance model. Path loss is NaN at the transmitter and, in an outdoor study, in cells that lie inside
+            buildings and have no path.
+        lower_db: Lower end of the interval [ny, nx], [dB]; NaN if there is no prediction or no level.
         upper_db: Upper end of the interval [ny, nx], [dB].
-        no_path: Mask of the cells predicted by the log-distance model because they have no path [ny, nx].
+        no_path: Mask of the cells without a path, for which the log-distance model predicts path loss [ny, nx].
         level: Probability that the interval contains a measurement; None for a map without intervals.
-        power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
+        power_dbm: Transmitted power for a map of received power [dBm]; None for a map of path loss.
         frame: Geographic frame of the scene; None if unknown.
-        triangles: The scene, for drawing.
-        observables: Further observables of the study [ny, nx], by name with unit, such as spread_ns.
+        triangles: The scene, used for drawing.
+        observables: Further observables of the study [ny, nx], by name including the unit, such as spread_ns.
     """
 
     tx: NDArray[np.float64]
@@ -88,7 +89,7 @@ class CoverageMap:
 
     @property
     def layers(self) -> dict[str, NDArray[np.float64]]:
-        """The mapped quantity and its interval by name, each [ny, nx]: path loss [dB] or received power [dBm]."""
+        """The mapped quantity, path loss [dB] or received power [dBm], and its interval; arrays [ny, nx] by name."""
         if self.power_dbm is None:
             best = {"path_loss_db": self.path_loss_db}
             interval = {"lower_db": self.lower_db, "upper_db": self.upper_db}
@@ -102,7 +103,7 @@ class CoverageMap:
         return best if self.level is None else best | interval
 
     def table(self) -> pd.DataFrame:
-        """One row per cell, from south to north and west to east: x_m, y_m, z_m, layers, observables, basis."""
+        """Tabulate the cells from south to north and west to east: x_m, y_m, z_m, layers, observables, basis."""
         x, y = np.meshgrid(self.x, self.y)
         predicted = np.where(self.no_path, NO_PATH, np.where(np.isfinite(self.path_loss_db), "model", ""))
         columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers, **self.observables, "basis": predicted}
@@ -114,9 +115,9 @@ class CoverageMap:
         """Write the map as a GeoTIFF, a picture and a table.
 
         Args:
-            folder: Folder to write `map.tif`, `map.png` and `map.csv` into; created if absent.
-            inputs: Files that the calculation reads; these are never replaced.
-            overwrite: Replace files that Calibray did not write.
+            folder: Folder for `map.tif`, `map.png` and `map.csv`; a missing folder is created.
+            inputs: Files that the calculation reads; these files are never replaced.
+            overwrite: If True, also replace files that Calibray did not write.
 
         Returns:
             Names of the files that were written; without rasterio, there is no GeoTIFF.
@@ -140,11 +141,11 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a north-up GeoTIFF: a band per layer and observable, and one that is 1 where there is no path.
+    """Write a map as a north-up GeoTIFF: a band per layer and observable, and a band that is 1 where there is no path.
 
     Args:
-        coverage: The map. Without a frame, coordinates are those of the scene, and no coordinate reference system is
-            declared.
+        coverage: The map. If the map has no frame, the GeoTIFF has the coordinates of the scene and declares no
+            coordinate reference system.
         path: The file.
 
     Raises:
@@ -162,7 +163,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
     rows, columns = coverage.z.shape
     layout = {"width": columns, "height": rows, "count": len(bands), "dtype": "float32", "nodata": np.nan}
     compressed = {"driver": "GTiff", "compress": "deflate", "predictor": 3}
-    # GDAL accepts only file names in UTF-8, so the file is made in memory.
+    # GDAL accepts only file names in UTF-8, so the file is created in memory.
     with rasterio.MemoryFile() as memory:
         with memory.open(**compressed, **layout, **georeference) as file:
             for number, (name, values) in enumerate(bands.items(), start=1):
@@ -182,7 +183,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
 
 @styled()
 def figure(coverage: CoverageMap) -> Figure:
-    """Draw a map over the outlines of buildings, with a second panel for half the width of the interval."""
+    """Draw a map with the outlines of buildings, and a second panel that shows half the width of the interval."""
     best, *ends = coverage.layers.values()
     panels: list[tuple[str, NDArray[np.float64], str]] = [
         ("Path loss [dB]", best, LOSS_COLORS)
@@ -216,14 +217,14 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     south, north = coverage.y[0] - half, coverage.y[-1] + half
     finite = np.where(np.isfinite(values), values, np.nan)
     low, high = _range(finite)
-    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);\nvalues outside take the end colours"
+    label += f"\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);\nvalues outside this range have the end colours"
     axes.set_facecolor(LINE)
     image = axes.imshow(
         finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,
         interpolation="nearest", zorder=1,
     )  # fmt: skip
     if coverage.no_path.any():
-        # With two points per cell, the hatched area ends near the edges of cells.
+        # With two points per cell, the hatched area ends near the edges of the cells.
         cells = np.kron(coverage.no_path, np.ones((2, 2)))
         ends = [
             (middle[:, None] + np.array([-half, half]) / 2).ravel() for middle in (coverage.x, coverage.y)

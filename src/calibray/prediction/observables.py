@@ -1,4 +1,4 @@
-"""Further observables at new links, and the interval for a measurement there."""
+"""Further observables of new links, with intervals for a measurement on these links."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.uncertainty.draws import evenly_spaced
 
 MOST_DRAWS: Final = 64
-"""Largest number of posterior draws for the width of an interval and the errors of biases. A standard deviation from 64
-draws has an error of 9 %."""
+"""Maximum number of posterior draws from which the width of an interval and the errors of biases are computed. A
+standard deviation estimated from 64 draws has a relative error of 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine for new links, and parameter values: those of the prediction model, then of every draw [1 + draws, d].
+    """An engine for new links, and the parameter values of the prediction model and then of every draw [1 + draws, d].
 
-    If path loss is averaged over two sets of values, both precede the draws, and `averaged` is 2. `answers` is the
+    If path loss is averaged over two sets of values, both sets precede the draws, and `averaged` is 2. `answers` is the
     path loss that an external program returns for the values before the draws [averaged, links], [dB].
     """
 
@@ -44,9 +44,9 @@ class Replayed(NamedTuple):
 
 
 def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
-    """Names of the columns of further observables, such as spread_ns, spread_lower_ns and spread_upper_ns.
+    """Names of the columns for further observables, such as spread_ns, spread_lower_ns and spread_upper_ns.
 
-    Without a level, values have no interval.
+    Without a level, there are no columns for the interval.
     """
     ends = ("",) if level is None else ("", "_lower", "_upper")
     return tuple(f"{name}{end}_{section.unit}" for name, section in study.observables.items() for end in ends)
@@ -55,10 +55,11 @@ def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
 def further_observables(
     result: Record, replayed: Replayed | None, level: float | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Further observables at the links of an opened study [links], without device biases, by column name.
+    """Predict further observables for the links of an opened study [links], without device biases, by column name.
 
-    The interval has two parts: the errors of individual values, from held-out links if there are any, and the scatter
-    of the draws. The result is empty if the study has no further observables, or if the prediction model uses no scene.
+    The interval combines two parts: the errors of individual values, taken from held-out links if there are any, and
+        the scatter of the draws. The result is empty if the study has no further observables, or if the prediction
+        model uses no scene.
     """
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
@@ -86,20 +87,21 @@ def further_observables(
 
 
 CHOICES: Final = (DELAY_SPREAD, EXCESS_DELAY, K_FACTOR, DEPARTURE_SPREAD, ARRIVAL_SPREAD)
-"""Observables that depend on materials and have no device bias."""
+"""Observables that depend on the materials and have no device bias."""
 
 RELATIVE_ERROR: Final = 0.1
 """Expected error of a spread or an excess delay that the study does not contain, relative to the RMS of its values. In
-downtown Boulder, delay spreads vary by 3 % in sight and by 15 % out of sight when the receiving array rotates."""
+downtown Boulder, rotating the receiving array changes delay spreads by 3 % in line of sight and by 15 % out of
+sight."""
 
 ERROR_DB: Final = 1.0
 """Expected error of a K-factor that the study does not contain [dB]."""
 
 
 class Worth(NamedTuple):
-    """The most informative observable at a suggestion and the suggestions above it.
+    """The most informative observable at a suggested link, assuming that the links ranked above it are also measured.
 
-    `narrowed` is the standard deviation expected for every parameter, relative to that with path loss alone [d].
+    `narrowed` is the expected standard deviation of every parameter, relative to that with path loss alone [d].
     """
 
     kind: str
@@ -113,10 +115,11 @@ def worth_measuring(
     index: NDArray[np.int64],
     information: NDArray[np.float64],
 ) -> list[Worth]:
-    """The most informative observable at every suggested link [suggestions], the best link first.
+    """Find the most informative observable at every suggested link [suggestions]; the best link comes first.
 
     Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, have the shape [n,
-    d]. Information matrices include the path loss of each suggestion and of those above it [suggestions, n, d, d].
+    d]. Each information matrix includes the path loss of a suggestion and of those ranked above it [suggestions, n, d,
+    d].
     """
     own = {section.kind: (name, section) for name, section in result.study.observables.items()}
     statistics = tuple(own[kind][1].statistic if kind in own else Statistic(kind) for kind in CHOICES)
@@ -134,7 +137,7 @@ def worth_measuring(
             name, section = own[kind]
             error = result.fit.observables[name].error * section.scale
         slope = np.nan_to_num(jacobian[:, column]) * unit_slope[:, None, :] / max(error, 1e-300)
-        # Each suggestion is measured in addition to those above it.
+        # Each suggestion is measured in addition to the suggestions ranked above it.
         added = np.cumsum(np.einsum("nli,nlj->lnij", slope, slope), axis=0)
         narrowed = np.mean(_deviation(information + added) / before, axis=1)
         for number, ratio in enumerate(narrowed):
@@ -151,11 +154,11 @@ def _deviation(information: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Predicted path loss and its interval, converted to the quantity that the study measures, by column name.
+    """Convert predicted path loss and its interval to the quantity that the study measures, by column name.
 
-    The quantity is path gain [dB], received power or RSRP [dBm]. The columns are, for example, `received_power_dbm`,
-    `received_power_lower_dbm` and `received_power_upper_dbm` [links]. The result is empty if path loss was measured, or
-    if the transmitted power of these links is unknown.
+    The measured quantity is path gain [dB], received power [dBm] or RSRP [dBm]. Column names are, for example,
+    `received_power_dbm`, `received_power_lower_dbm` and `received_power_upper_dbm` [links]. The result is empty if path
+    loss itself was measured, or if the transmitted power of the links is unknown.
     """
     quantity = study.links.quantity
     reference = _reference_level(study, links)
@@ -172,12 +175,12 @@ def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[
 
 
 def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] | None:
-    """The level from which path loss is subtracted [links], [dBm] or [dB]; None if unknown."""
+    """The level from which path loss is subtracted [links], in [dBm] or [dB]; None if the level is unknown."""
     section = study.links
     if section.quantity == "path_loss":
         return None
     if section.quantity != "received_power":
-        # Path gain is 0 dB minus path loss. The transmitted power of RSRP is part of the offset.
+        # Path gain is 0 dB minus path loss. For RSRP, the transmitted power is part of the offset.
         return np.zeros(len(links))
     power = PORT_POWER if states_port_power(study) else section.tx_power_dbm
     if isinstance(power, str):

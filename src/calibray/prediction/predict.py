@@ -1,4 +1,4 @@
-"""Path loss at new links with the calibrated scene and nuisances, and an interval for a measurement there."""
+"""Path loss of new links with the calibrated scene and nuisances, and an interval for a measurement on each link."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ from calibray.validation.models import without_scene
 _LOG: Final = logging.getLogger(__name__)
 
 NEIGHBOURS: Final = (0.125, 0.5)
-"""Displacements at which antennas are traced, as shares of the largest displacement: 1 m and 4 m if the largest is 8
+"""Displacements at which antennas are traced, as shares of the largest displacement; if this is 8 m, they are 1 m and 4
 m."""
 
 NEAR_SHARE: Final = 0.1
-"""A link counts as near measured links if they explain more than this share of the residual field's variance."""
+"""A link counts as near measured links if these explain more than this share of the residual field's variance."""
 
 WEAKER_DB: Final = 10.0
-"""Excess over the largest calibrated path loss above which a prediction gets a remark [dB]. In a synthetic town with
-wrong building heights, the errors of such predictions were up to 46 dB."""
+"""A prediction gets a remark if it exceeds the largest calibrated path loss by more than this value [dB]. In a
+synthetic town with wrong building heights, predictions above this limit had errors of up to 46 dB."""
 
 
 SAME_ANSWER_DB: Final = 0.01
-"""Difference between a program's answer for a calibration link and the stored answer, above which Calibray warns
+"""Calibray warns if a program's path loss for a calibration link differs from the stored value by more than this
 [dB]."""
 
 
@@ -72,7 +72,7 @@ def predict(
     *,
     allow_changed_inputs: bool = False,
 ) -> NDArray[np.float64]:
-    """Predict path loss at new links; see `Result.predict`.
+    """Predict the path loss of new links; see `Result.predict`.
 
     Raises:
         InputError: A column is missing, a position cannot be used, all receivers are far from the scene, a group has no
@@ -91,32 +91,33 @@ def predict_interval(
     *,
     allow_changed_inputs: bool = False,
 ) -> pd.DataFrame:
-    """Predict path loss at new links, with an interval for a measurement there; see `Result.predict_interval`.
+    """Predict the path loss of new links, with an interval for a measurement; see `Result.predict_interval`.
 
-    The width of the interval has up to three parts. The first is the size of the residuals of individual links, on
-    held-out links if the calibration has any. The second is the scatter of the draws; it is omitted if blocks were held
-    out, because their residuals include it. The third is the spread between groups, for links of a group without
-    measurements.
+    The width of the interval has up to three parts. The first part is the size of the residuals of individual links,
+    taken from held-out links if the calibration has any. The second part is the scatter of the draws; if blocks were
+    held out, this part is omitted, because their residuals include it. The third part, for links of a group without
+    measurements, is the spread between groups.
 
     Raises:
-        InputError: `predict` would refuse the input for a reason other than unknown groups; the level is not between 0
-            and 1; or the calibration had too few links to estimate the size of residuals.
+        InputError: `predict` would reject the input for a reason other than unknown groups, the level is not between 0
+            and 1, or the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     refuse_far_links(result, setup.links, read_triangles(setup.scene))
     table = interval(result, setup, level, progress)
     table = add_remarks(result, setup, table.assign(**as_measured(result.study, setup.links, table)))
-    # pandas assigns columns by index, so the columns of a sorted or filtered table need its index.
+    # pandas aligns assigned columns by index, so predictions for a sorted or filtered table need the index of that
+    # table.
     if isinstance(links, pd.DataFrame) and len(links) == len(table):
         return table.set_axis(links.index, axis="index")
     return table
 
 
 def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
-    """New links from a table or from rows of a file, with the groups and carriers in the columns that the study names.
+    """Read new links from a table or from rows of a file; the study names the columns of their groups and carriers.
 
     Raises:
-        InputError: The links are not a table, a column of the groups, carriers or antennas is missing, or a position is
+        InputError: The links are not a table, a column for groups, carriers or antennas is missing, or a position is
             not finite.
     """
     if isinstance(links, Measurements):
@@ -129,7 +130,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
     if not isinstance(links, SourceTable):
         raise InputError(
             f"links: is a {type_name(links)}, must be a pandas DataFrame, such as pandas.read_csv(file) for a file, or "
-            "table.to_pandas() for a table of another package"
+            "table.to_pandas() for a table from another package"
         )
     placed = result.study.places(links)
     check_mounting_columns(result.study, placed.table)
@@ -137,7 +138,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 
 
 def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:
-    """The links with labels spelled as in the measurements: for example 007, which is read as 7 in a numeric column."""
+    """Spell labels as in the measurements; for example, a numeric column turns the label 007 into 7."""
     for term in model.terms:
         spelling: dict[str, set[str]] = {}
         for label in term.coefficients:
@@ -158,11 +159,11 @@ def _spelled(
 
 
 def _as_number(label: str) -> str:
-    """A label, possibly composed of several columns, as it is read if these columns contain only numbers."""
+    """The form of a label after reading, if the columns from which the label is composed contain only numbers."""
     parts = []
     for part in label.split(" "):
         try:
-            # Python reads 1_2 as 12, but tables keep it as text.
+            # Python reads 1_2 as 12, but tables keep 1_2 as text.
             parts.append(part if "_" in part else str(float(part)).removesuffix(".0"))
         except ValueError:
             parts.append(part)
@@ -173,7 +174,8 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
     """Open the study of a calibration for new links.
 
     Raises:
-        InputError: The scene or the parameters cannot be used, or a file of the scene or an antenna has changed.
+        InputError: The scene or the parameters cannot be used, or a file of the scene or an antenna has changed since
+            the calibration.
     """
     warn_of_carriers(result, links)
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
@@ -182,12 +184,12 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
 
 
 def warn_of_carriers(result: Record, links: Measurements) -> None:
-    """Warn if links lack the study's column of carriers, or have carriers without measurements."""
+    """Warn if links lack the study's column of carriers, or have carriers at which nothing was measured."""
     column = result.study.links.frequency
     if column is not None and links.frequency is None:
         _LOG.warning(
-            "%s: lacks the column of carriers %r, so all links are predicted at scene.frequency = %s; add the column "
-            "for other carriers", links.source, column, hertz(result.study.scene.frequency),
+            "%s: lacks the column of carriers %r, so all links are predicted at scene.frequency = %s; for other "
+            "carriers, add the column", links.source, column, hertz(result.study.scene.frequency),
         )  # fmt: skip
     if links.frequency is not None and "frequency" in result.links:
         low, high = result.links["frequency"].min(), result.links["frequency"].max()
@@ -197,15 +199,15 @@ def warn_of_carriers(result: Record, links: Measurements) -> None:
             if low < high:
                 measured = f"outside the measured range of {hertz(low)} to {hertz(high)}"
             _LOG.warning(
-                "%s: %d of %d links have carriers %s; materials are extrapolated, which the intervals do not "
-                "account for", links.source, beyond.sum(), len(links), measured,
+                "%s: %d of %d links have carriers %s; materials are extrapolated, and the intervals do not account for "
+                "this", links.source, beyond.sum(), len(links), measured,
             )  # fmt: skip
 
 
 def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) -> None:
-    """Refuse links if all their receivers are far from the scene, given the triangles of the scene.
+    """Reject links if all their receivers are far from the scene, given the triangles of the scene.
 
-    Nothing is refused if some triangles are unknown, because the size of the scene is then unknown.
+    No links are rejected if some triangles are unknown, because the size of the scene is then unknown.
 
     Raises:
         InputError: All receivers are far from the scene.
@@ -219,17 +221,17 @@ def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) 
 
 
 def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:
-    """The materials for the trace if the paths depend on them; otherwise None, because one trace is valid for all.
+    """The materials for the trace if the paths depend on the materials; otherwise None, because one trace suits all.
 
-    The tracer's sampling depends on the materials only with refraction or diffuse reflection. The powers of a program's
-    rays always depend on the materials.
+    With refraction or diffuse reflection, and only then, the tracer's sampling depends on the materials. The powers of
+    rays from an external program always depend on the materials.
     """
     trace, rays = result.study.trace, result.study.engine.exports_rays
     return materials if trace.refraction or trace.diffuse_reflection or rays else None
 
 
 def check_groups(result: Record, links: Measurements) -> None:
-    """Refuse links of groups without a coefficient, before anything is traced.
+    """Before anything is traced, reject links of groups without a coefficient.
 
     Raises:
         InputError: A group has no calibrated coefficient, or a column is missing.
@@ -240,7 +242,7 @@ def check_groups(result: Record, links: Measurements) -> None:
 
 
 def _with_columns(result: Record, setup: Setup) -> Setup:
-    """The opened study with the columns computed from the scene, if the prediction model or its errors require them."""
+    """Add the columns that are computed from the scene, if the prediction model or its errors require these columns."""
     model = result.prediction.model
     used = any({term.by, term.per} & {*OBSTRUCTION, CLUSTER} for term in model.terms)
     differ = model.blocks is not None and model.blocks.out_of_sight > 1
@@ -250,9 +252,9 @@ def _with_columns(result: Record, setup: Setup) -> Setup:
 def interval(
     result: Record, setup: Setup, level: float | None, progress: Progress | None = None
 ) -> pd.DataFrame:
-    """Predict path loss and its interval at the links of an opened study.
+    """Predict path loss and its interval for the links of an opened study.
 
-    There is one row per link: path_loss_db, basis and, with a level, lower_db and upper_db.
+    The table has one row per link, with the columns path_loss_db, basis and, with a level, lower_db and upper_db.
 
     Raises:
         InputError: The level is not between 0 and 1, or the calibration had too few links to estimate the size of
@@ -263,7 +265,7 @@ def interval(
     setup = _with_columns(result, setup)
     links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
     if level is None:
-        # A group without a coefficient is refused before anything is traced.
+        # A group without a coefficient is rejected before anything is traced.
         shift = nuisance_shift(model_terms(model, links), links)
         replayed = _replay(result, setup, {}, progress)
         field_db, _ = _residual_field(result, links)
@@ -274,22 +276,22 @@ def interval(
         return fill_missing(result.prediction, result.study, links, table)
     if model.residual_db is None:
         raise InputError(
-            f"{result.study.path}: {result.counts['calibrated_on']} links are too few to estimate the size of "
-            "residuals; measure more, or predict without a level"
+            f"{result.study.path}: too few links ({result.counts['calibrated_on']}) to estimate the size of residuals; "
+            "measure more links, or predict without a level"
         )
     field_db, known_share = _residual_field(result, links)
-    # Draws belong to the calibrated model; errors on held-out blocks already include the parameters' uncertainty.
-    # A validation that was added to a finished result does not change the model's errors.
+    # Only the calibrated model has draws; errors on held-out blocks already include the uncertainty of the parameters.
+    # Adding a validation to a finished result does not change the model's errors.
     by_blocks = result.study.holds_out_blocks
     draws = result.uncertainty.draws if model.name == Model.CALIBRATED and not by_blocks else {}
     shift = nuisance_shift(model_terms(model, links), links, draws, new_groups=True)
     replayed = _replay(result, setup, draws, progress)
     modelled = _modelled(result, links, replayed) + shift.value_db
     best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
-    # Deviations are measured from the best value, so the difference between it and the mean of the draws is included.
+    # Deviations are measured from the best value, so they include its difference from the mean of the draws.
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     factor, between = _quantiles(model, level)
-    # The interval is scaled by `factor`, the quantile for links; `between` converts it to the quantile for blocks.
+    # The interval is scaled by `factor`, the quantile for links; `between` converts this quantile to that for blocks.
     variance = (between * shift.spread_db) ** 2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
     basis = model.basis
@@ -318,10 +320,11 @@ def interval(
 
 
 def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
-    """Quantile of Student's t for errors of links, and the ratio of the quantile for blocks to this one.
+    """Quantile of Student's t for errors of links, and the ratio to it of the quantile for errors of blocks.
 
-    Both variances are estimates with their own degrees of freedom. Errors of blocks have as many degrees of freedom as
-    there are blocks, because they are deviations from zero, not from an estimated mean.
+    The variances within and between blocks are estimates, each with its own degrees of freedom. Errors of blocks have
+    as many degrees of freedom as there are blocks, because these errors are deviations from zero, not from an estimated
+    mean.
     """
     count = 0 if model.blocks is None else model.blocks.blocks
     factor = float(stdtrit(max(model.links - count, 1), (1 + level) / 2))
@@ -329,12 +332,12 @@ def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
 
 
 def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
-    """Standard deviation of the prediction model's errors at new links [links], [dB]; `ratio` scales the blocks' part.
+    """Standard deviation of the model's errors at new links [links], [dB]; `ratio` scales the part between blocks.
 
-    Farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a factor of
-    up to two. Such a distant position may differ from the blocks as much as the blocks differ from each other. The
-    contribution of random effects to these errors is subtracted, because `nuisance_shift` adds their spread for links
-    of a new group.
+    For links farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a
+    factor of up to two. A link this far away may differ from the blocks as much as the blocks differ from each other.
+    The contribution of random effects is subtracted, because `nuisance_shift` adds the spread of these effects for
+    links of a new group.
     """
     model, ends = result.prediction.model, result.ends
     if model.blocks is None or ends is None:
@@ -350,11 +353,12 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
 
 
 def with_constants(result: Record, setup: Setup) -> Setup:
-    """Add the constants of the scene that vary in the draws to the parameters of an opened study.
+    """Add the scene's constants that vary in the draws to the parameters of an opened study.
 
     Returns:
-        The study with these parameters after its own; unchanged for a program that returns rays, because only the
-        constants of that program vary in the draws. A constant that differs between carriers is not added.
+        The study with these constants after its own parameters. The study is unchanged for a program that returns rays,
+        because only the constants of that program vary in the draws. A constant that differs between carriers is not
+        added.
     """
     if result.study.engine.exports_rays:
         return setup
@@ -371,11 +375,11 @@ def with_constants(result: Record, setup: Setup) -> Setup:
 def _replay(
     result: Record, setup: Setup, draws: dict[str, list[float]], progress: Progress | None
 ) -> Replayed | None:
-    """The engine for opened links, with the values of the prediction model and of every draw; None without a scene.
+    """The engine for opened links, with the values of the prediction model and of all draws; None without a scene.
 
-    A program is called for the values of the prediction model, and for both sets of values of an average, because the
-    program may differ from the replay in antennas and physics. The replay provides the change in path loss for each
-    draw.
+    A program is called for the values of the prediction model (for both sets of values if the model is an average),
+    because the program may differ from the replay in antennas and physics. The replay provides the change in path loss
+    for each draw.
     """
     prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
@@ -386,7 +390,7 @@ def _replay(
     if draws:
         setup = with_constants(result, setup)
         names = setup.parameters.names
-        # Only the calibrated model has draws, and it is not averaged: `values` has one row.
+        # Only the calibrated model has draws, and this model is not averaged, so `values` has one row.
         scene_values = setup.parameters.start[None, values.shape[1] :]
         drawn = np.stack([draws[name] for name in names], axis=1)
         values = np.vstack([np.hstack([values, scene_values]), drawn])
@@ -413,11 +417,11 @@ def _replay(
 
 
 def _with_calibration_link(result: Record, setup: Setup) -> tuple[Setup, NDArray[np.float64]]:
-    """The opened study with one calibration link after the new links, and this link's stored path loss [1], [dB].
+    """Append one calibration link to the new links; return the opened study and this link's stored path loss [1], [dB].
 
-    The weakest link with a path is used, because the path loss of weak links depends on most parts of a program. If the
-    engine is not a program, or no such link has a carrier of the new links, the setup is unchanged, and there is no
-    stored path loss [0].
+    The weakest link with a path is used, because the path loss of a weak link depends on most parts of a program. If
+    the engine is not a program, or no link with a path has a carrier of the new links, the setup is unchanged, and the
+    stored path loss is empty [0].
     """
     links, ends, table = setup.links, result.ends, result.links
     stored_db = table["scene_db"].to_numpy(float)
@@ -441,7 +445,7 @@ def _with_calibration_link(result: Record, setup: Setup) -> tuple[Setup, NDArray
 def _warn_of_changed_program(
     result: Record, answer_db: NDArray[np.float64], stored_db: NDArray[np.float64]
 ) -> None:
-    """Warn if a program's answer for a calibration link [0 or 1] differs from the stored path loss."""
+    """Warn if the path loss that a program returns for a calibration link [0 or 1] differs from the stored value."""
     for answer, stored in zip(answer_db.tolist(), stored_db.tolist(), strict=True):
         if not abs(answer - stored) <= SAME_ANSWER_DB:
             _LOG.warning(
@@ -467,11 +471,11 @@ def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _modelled(result: Record, links: Measurements, replayed: Replayed | None) -> NDArray[np.float64]:
-    """Path loss of the prediction model without nuisances, then of every draw [1 + draws, links], [dB]."""
+    """Path loss without nuisances, of the prediction model and then of every draw [1 + draws, links], [dB]."""
     if replayed is None:
         return without_scene(result.study, links)[None]
     path_loss_db = _path_loss(replayed)
-    # Path loss is limited to the ceiling, as in the fit and on held-out links.
+    # As in the fit and on held-out links, path loss is limited to the ceiling.
     ceiling_db = result.study.objective.ceiling_db
     path_loss_db = path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
     best_db, average = path_loss_db[0], AVERAGES.get(result.prediction.model.name)
@@ -483,7 +487,7 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
 
 
 def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
-    """Path loss for all values [n, links], [dB]; for a program, its answers plus the changes that replay computes."""
+    """Path loss for all values [n, links], [dB]; for a program, the sum of its answers and the changes from replay."""
     if (answers := replayed.answers) is None:
         return replayed.engine.path_loss(replayed.values)
     if len(replayed.values) == len(answers):
@@ -495,7 +499,7 @@ def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
 
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The residual field kriged to links [links], [dB], and the known share of its variance [links]."""
+    """Krige the residual field to links [links], [dB], and compute the known share of its variance [links]."""
     field, ends = result.prediction.residual_field, result.ends
     if field is None or links.frequency is not None or ends is None:
         return np.zeros(len(links)), np.zeros(len(links))
@@ -504,7 +508,7 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
 
 
 def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
-    """Refuse a scene or an antenna with a file that has changed since the calibration.
+    """Reject a scene or an antenna if one of its files has changed since the calibration.
 
     Raises:
         InputError: A file has changed.
@@ -517,7 +521,7 @@ def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
 
 
 def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.DataFrame:
-    """Predictions with a column of remarks on the ends of each link or, if there are none, on its path loss.
+    """Add a column of remarks on the ends of each link or, if the ends need no remark, on its path loss.
 
     If most calibrated receivers are inside a building, remarks on ends inside a building are omitted.
     """
@@ -530,23 +534,22 @@ def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.D
                 [f"{end} {at}" if at and not (indoors and at == INSIDE) else "" for at in locations]
             )
     weak = _weak(result, predictions["path_loss_db"].to_numpy(float))
-    # A remark on a position takes precedence, because the position explains a weak link.
+    # A remark on a position takes precedence, because the position can explain why a link is weak.
     remarks = [", ".join(filter(None, ends)) or other for *ends, other in zip(*by_end, weak, strict=True)]
     return predictions.assign(remark=np.array(remarks, dtype=np.str_))
 
 
 def _weak(result: Record, path_loss_db: NDArray[np.float64]) -> list[str]:
-    """The remark on links far weaker than every link used by the calibration [links].
+    """The remark on links that are far weaker than all links used in the calibration [links].
 
-    The model was not fitted to such links. Measured links near the noise floor are not used, so they do not count.
+    The model was not fitted to links this weak. Measured links near the noise floor do not count, because the
+    calibration does not use them.
     """
     measured_db = result.links["measured_db"].to_numpy(float)
     if "faint" in result.links:
         measured_db = measured_db[~result.links["faint"].to_numpy(bool)]
     weak = path_loss_db > measured_db.max(initial=-np.inf) + WEAKER_DB
-    return np.where(
-        weak, f"over {WEAKER_DB:g} dB weaker than every link used by the calibration", ""
-    ).tolist()
+    return np.where(weak, f"over {WEAKER_DB:g} dB weaker than all links used in the calibration", "").tolist()
 
 
 def is_indoors(result: Record, triangles: Triangles) -> bool:

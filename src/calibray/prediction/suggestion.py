@@ -1,4 +1,4 @@
-"""Suggestions of where to measure next: candidates ranked by the expected uncertainty after measuring them."""
+"""Suggestions of where to measure next: candidates are ranked by the uncertainty expected after they are measured."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 
 MOST_DRAWS: Final = 96
-"""Largest number of posterior draws that are used to rank the candidates."""
+"""Maximum number of posterior draws used to rank the candidates."""
 
 VALUES_PER_RANGE: Final = 24
-"""Number of values that are added in each separate range of a parameter, because some ranges contain few draws."""
+"""Number of values added in each separate range of a parameter, because some ranges contain few draws."""
 
 LEAST_GAIN: Final = 0.02
-"""Smallest relative narrowing of an interval, and smallest gain in probability, that are reported as text."""
+"""Smallest relative narrowing of an interval, and smallest gain in probability, that the text reports."""
 
 
 def suggest(
@@ -72,35 +72,36 @@ def suggest(
     allow_changed_inputs: bool = False,
     observables: bool = False,
 ) -> pd.DataFrame:
-    """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
+    """Suggest where to measure next, based on how much each measurement should narrow the parameters' intervals.
 
-    Each candidate is traced and replayed for draws from the posterior. If the draws predict the same path loss, a
-    measurement adds no information. If they differ by more than the error of a link, a measurement rules out some
-    draws. Candidates are chosen one at a time, each as the best addition to the earlier ones. Candidates are left out
-    if a calibration would leave them out because their mean predicted power is too near the study's noise floor. A
-    warning in the log states their number and the required margin.
+    Each candidate is traced and then replayed for draws from the posterior. If all draws predict the same path loss for
+    a candidate, measuring it adds no information. If the predictions differ by more than the error of a link, a
+    measurement rules out some of the draws. Candidates are chosen one at a time; each is the best addition to those
+    already chosen. Candidates whose mean predicted power is too near the study's noise floor are left out, as in a
+    calibration. A warning in the log states the number of candidates left out and the required margin.
 
     Args:
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
-        candidates: Possible measurements: links, or a table, as for `Result.predict`.
-        count: Largest number of suggestions; a warning is logged if there are fewer.
-        progress: Called with the name of each stage, the completed work and the total.
-        allow_changed_inputs: Continue even if the links, or a file of the scene or an antenna, have changed since the
-            calibration.
-        observables: Also report which further observable is worth measuring at each suggestion.
+        candidates: Possible measurements, given as links or as a table, as for `Result.predict`.
+        count: Maximum number of suggestions; if there are fewer, a warning is logged.
+        progress: Function that is called with the name of each stage, the completed work and the total.
+        allow_changed_inputs: If True, continue even if the links, or a file of the scene or an antenna, have changed
+            since the calibration.
+        observables: If True, also report which further observable is worth measuring at each suggestion.
 
     Returns:
-        One row per suggestion, best first. The first columns are the candidate's row, its positions [m] and its group.
-        The columns path_loss_db and spread_db are the mean and the standard deviation of the draws' predictions [dB].
-        For every parameter, NAME_width is the expected width of its 95 % interval once this candidate and those above
-        are measured. For a parameter with several ranges, NAME_sure is the expected probability that the right range is
-        known. The column gain summarizes these gains in words. With `observables`, the column observable names the
-        quantity that narrows the intervals most if it is measured in addition to path loss at this candidate and those
-        above. The column observable_gain summarizes its gain in words.
+        A table with one row per suggestion, the best suggestion first. The first columns are the candidate's row, its
+        positions [m] and its group. The columns path_loss_db and spread_db are the mean and the standard deviation of
+        the draws' predictions [dB]. For every parameter, NAME_width is the expected width of the 95 % interval after
+        this candidate and those above it are measured. For a parameter with several separate ranges, NAME_sure is the
+        expected probability that the right range is known. The column gain summarizes these gains in words. With
+        `observables`, the column observable names the quantity that narrows the intervals most if measured, in addition
+        to path loss, at this candidate and those above it. The column observable_gain summarizes in words what the
+        observable gains.
 
     Raises:
-        InputError: `Result.predict` would refuse the input for a reason other than unknown groups; the calibration has
-            no draws; or no candidate has a path and a predicted power far enough above the study's noise floor.
+        InputError: `Result.predict` would reject the input for a reason other than unknown groups, the calibration has
+            no draws, or no candidate has a path and a predicted power far enough above the study's noise floor.
     """
     check_record(result)
     if isinstance(count, bool) or not (isinstance(count, Integral) and count >= 1):
@@ -108,13 +109,13 @@ def suggest(
     study = result.study
     if study.engine.external:
         raise InputError(
-            f"{study.path}: the engine {study.engine.name!r} gives no derivatives, which suggestions require; "
-            "calibrate on the engine 'replay'"
+            f"{study.path}: the engine {study.engine.name!r} provides no derivatives, which suggestions require; "
+            "calibrate with the engine 'replay'"
         )
     if not result.uncertainty.draws:
         raise InputError(
-            f"{study.path}: the result has no draws from the posterior; calibrate on the engine 'replay', with more "
-            "links than unknowns"
+            f"{study.path}: the result has no draws from the posterior; calibrate with the engine 'replay' and with "
+            "more links than unknowns"
         )
     start_stage(progress, "reading scene and links")
     links = as_links(result, candidates)
@@ -125,8 +126,8 @@ def suggest(
     check_inputs(result, setup, allow_changed_inputs)
     if not allow_changed_inputs and not has_links(result, calibrated.links):
         raise InputError(
-            f"{calibrated.links.source}: its links changed since the calibration, and suggestions need the calibrated "
-            "ones; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
+            f"{calibrated.links.source}: the links changed since the calibration, but suggestions need the links that "
+            "were calibrated; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
         )
     if len(result.links) != len(calibrated.links):
         raise InputError(
@@ -140,9 +141,7 @@ def suggest(
     predicted, slope, errors = model.at(setup)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
     if not len(reached):
-        raise InputError(
-            f"{links.source}: none of {len(links)} candidates has a path; choose other positions"
-        )
+        raise InputError(f"{links.source}: no candidate has a path (of {len(links)}); choose other positions")
     margin_db = model.floor_margin_db()
     reached = _received(result, links, predicted[: model.num_draws].mean(axis=0), reached, margin_db)
     errors = replace(errors, common=errors.common[reached], position=errors.position[reached])
@@ -151,7 +150,7 @@ def suggest(
     outlooks = choose_candidates(beliefs, predicted[:, reached], slope[:, reached], errors, count)
     if len(outlooks) < count:
         LOG.warning(
-            "%d suggestions instead of %d: only %d of %s candidates have a path and enough power",
+            "fewer suggestions (%d) than requested (%d): only %d of %s candidates have a path and enough power",
             len(outlooks), count, len(reached), f"{len(links):,}",
         )  # fmt: skip
     outlooks = [replace(outlook, index=int(reached[outlook.index])) for outlook in outlooks]
@@ -175,7 +174,7 @@ def _received(
     reached: NDArray[np.int64],
     margin_db: float,
 ) -> NDArray[np.int64]:
-    """The candidates in `reached` (those with a path) whose predicted power exceeds the noise floor by the margin.
+    """Select the candidates in `reached` (those with a path) whose predicted power exceeds the floor by the margin.
 
     All of `reached` is returned if the study has no noise floor, or if the candidates' transmitted power is unknown.
 
@@ -193,7 +192,7 @@ def _received(
     if margin_db:
         reason = (
             f"less than {margin_db:.1f} dB above links.noise_floor_dbm = {floor:g}, and the calibration uses no links "
-            "so near it"
+            "this close to the floor"
         )
     if not len(received):
         raise InputError(
@@ -202,19 +201,19 @@ def _received(
         )
     if left_out:
         LOG.warning(
-            "%s of %s candidates are left out: their predicted power is %s",
+            "%s of %s candidates left out, because the predicted power is %s",
             f"{left_out:,}", f"{len(links):,}", reason,
         )  # fmt: skip
     return received
 
 
 class _ReplayedDraws:
-    """The draws of a calibration, replayed at the calibration's own links and at candidates.
+    """The draws of a calibration, replayed on the calibration links and on the candidates.
 
     Args:
         result: The calibration.
         setup: The opened study of the calibration.
-        progress: Called with the name of each stage, the completed work and the total.
+        progress: Function that is called with the name of each stage, the completed work and the total.
     """
 
     def __init__(self, result: Record, setup: Setup, progress: Progress | None) -> None:
@@ -223,12 +222,12 @@ class _ReplayedDraws:
         start_stage(progress, "evaluating draws")
         problem = _as_calibrated(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
-        # Constants of the scene have tight priors, so they take no degrees of freedom from the residuals.
+        # Constants of the scene have tight priors, so they use up no degrees of freedom of the residuals.
         freedom = problem.freedom + len(parameters) - len(result.study.parameters)
         if freedom < 1:
             raise InputError(
-                f"{result.study.path}: {objective.num_counted} links are too few to estimate the size of residuals; "
-                "measure more, or calibrate fewer parameters"
+                f"{result.study.path}: too few links ({objective.num_counted}) to estimate the size of residuals; "
+                "measure more links, or calibrate fewer parameters"
             )
         self.inflation = float(np.sqrt(objective.num_counted / freedom))
         self.noise_db = max(result.rmse_db * self.inflation, LEAST_NOISE_DB)
@@ -252,8 +251,9 @@ class _ReplayedDraws:
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
         """Predict the path loss of the candidates and the errors of their measurements.
 
-        The results are path loss for every draw and further value [m, candidates], [dB]; its derivatives with respect
-        to the unit cube's coordinates, for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
+        The first result is path loss for each draw and each further value [m, candidates], [dB]. The second contains
+        its derivatives with respect to the coordinates of the unit cube, at the draws [n, candidates, d], [dB]. The
+        third contains the expected errors of measurements.
         """
         objective, links = self.problem.objective, setup.links
         engine = self._engine(setup)
@@ -270,10 +270,10 @@ class _ReplayedDraws:
         return path_loss_db, (slope + design @ coefficient_slopes)[: self.num_draws], errors
 
     def floor_margin_db(self) -> float:
-        """Distance from the noise floor within which a calibration leaves out a link by its predicted path loss [dB].
+        """Distance from the noise floor within which a calibration leaves out links, based on predicted path loss [dB].
 
-        The margin is that of `leave_out_near_floor`, or the smallest distance of a calibrated link from the floor if
-        that is smaller. The margin is 0 without a noise floor, and with censored links, because the draws then use
+        The margin is that of `leave_out_near_floor` or, if smaller, the smallest distance of a calibration link from
+        the floor. The margin is 0 if there is no noise floor, or if links are censored, because the draws then use
         links near the floor.
         """
         links, counted = self.problem.setup.links, self.problem.objective.weight > 0
@@ -283,17 +283,17 @@ class _ReplayedDraws:
         return float(np.clip(distance_db.min(), 0.0, MARGIN * self.noise_db))
 
     def worth(self, setup: Setup, index: NDArray[np.int64], information: NDArray[np.float64]) -> list[Worth]:
-        """Further observables at suggested candidates; see `worth_measuring`.
+        """Find the further observables worth measuring at suggested candidates; see `worth_measuring`.
 
         Raises:
-            InputError: The engine computes only path loss.
+            InputError: The engine computes path loss but no further observables.
         """
         engine, values = self._engine(setup), self.values[: self.num_draws]
         section = setup.study.engine
         if not isinstance(engine, Observing) or getattr(section, "compress_db", None) is not None:
             raise InputError(
-                f"{setup.study.path}: further observables require paths that engine.compress_db omits; suggest "
-                "without them"
+                f"{setup.study.path}: further observables require paths that engine.compress_db omits; suggest without "
+                "further observables"
             )
         unit_slope = self.problem.parameters.search_slope(values) * self.width
         return worth_measuring(self.result, engine, (values, unit_slope), index, information)
@@ -305,17 +305,17 @@ class _ReplayedDraws:
         return replay(setup, setup.trace(materials, self.progress), compress_db)
 
     def _replay(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss for every draw and further value [m, links], and unit-cube derivatives [m, links, d], [dB]."""
+        """Path loss for all draws and further values [m, links], and derivatives in the unit cube [m, links, d]."""
         loss, slope = engine.path_loss_and_jacobian(self.values)
         return loss, slope * (self.problem.parameters.search_slope(self.values) * self.width)[:, None, :]
 
     def _information(self, evaluation: Evaluation) -> NDArray[np.float64]:
-        """Fisher information of the links about the parameters in the unit cube, at every evaluated point [m, d, d]."""
+        """Fisher information from the links on the parameters in the unit cube, at every evaluated point [m, d, d]."""
         slopes = evaluation.slopes * self.width / self.noise_db
         return np.einsum("nmi,nmj->nij", slopes, slopes)
 
     def _further_values(self, draws: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values around the draws of every separate range, with the scatter that the curvature implies [k, d]."""
+        """Draw values around the draws of every separate range, with the scatter that the curvature implies [k, d]."""
         parameters, piece = self.problem.parameters, self._pieces(draws)
         members = [
             np.flatnonzero(piece[:, k] == number)
@@ -334,7 +334,7 @@ class _ReplayedDraws:
         return parameters.from_search(np.clip(points + step, self.lower, self.lower + self.width))
 
     def _pieces(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Index of the separate range that contains, or is nearest to, each parameter's value [m, d]."""
+        """Index of the separate range that contains each parameter's value or is nearest to it [m, d]."""
         piece = np.zeros(values.shape, dtype=np.int64)
         for k, name in enumerate(self.problem.parameters.names):
             interval = self.result.intervals.get(name)
@@ -345,10 +345,10 @@ class _ReplayedDraws:
         return piece
 
     def _nuisance(self, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Design matrix of the nuisance at candidates [candidates, q], and the uncertainty of the nuisance there.
+        """Design matrix of the nuisance for the candidates [candidates, q], and the uncertainty of the nuisance.
 
-        The uncertainty [candidates, unknowns], [dB], has a column for each coefficient, from the posterior given the
-        calibration links, and a column for each group without measurements.
+        The uncertainty [candidates, unknowns], [dB], has a column for each coefficient, computed from the posterior
+        given the calibration links, and a column for each group without measurements.
         """
         objective, nuisance = self.problem.objective, self.problem.objective.nuisance
         if not nuisance.terms:
@@ -360,7 +360,7 @@ class _ReplayedDraws:
         )
 
     def _term(self, term: Term, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Design columns of a term at candidates, and a column of uncertainty for each group without measurements."""
+        """Design columns of a term for candidates, and an uncertainty column for each group without measurements."""
         study = self.result.study
         if term.name == OFFSET:
             labels = links.group if study.offset is not None and study.offset.per is not None else None
@@ -369,7 +369,8 @@ class _ReplayedDraws:
             labels = None if per is None or term.labels == ("",) else links.table.labels(per)
         coefficients = self.result.nuisance.coefficients.get(term.name, {})
         at_links = term.at(links, labels)
-        # A group without measurements gets the mean of the other groups; a random effect's deviation from it is 0.
+        # A group without measurements gets the mean of the other groups; for a random effect, its deviation from the
+        # mean is 0.
         others = 0.0 if term.around else 1.0 / len(term.labels)
         share = np.where(at_links.group[:, None] < 0, others, np.eye(len(term.labels))[at_links.group])
         new = np.flatnonzero(at_links.group < 0)
@@ -381,7 +382,7 @@ class _ReplayedDraws:
         return share * at_links.value[:, None], unknown
 
     def _errors(self, candidates: Measurements, common: NDArray[np.float64]) -> Errors:
-        """Expected errors of candidates. Candidates have no weights, so all calibration links are weighted equally.
+        """Expected errors of candidates. Candidates have no weights, so all calibration links are given equal weight.
 
         `common` is as in `Errors`. Residuals of neighbouring links may be correlated, unless the study rules this out.
         """
@@ -399,7 +400,7 @@ class _ReplayedDraws:
 
 
 def _as_calibrated(result: Record, problem: Problem) -> Problem:
-    """The problem as calibrated: with the estimated spreads and errors, and priors of the constants in the draws.
+    """The calibration problem, with the estimated spreads and errors, and with priors on the constants in the draws.
 
     Links near the noise floor are excluded.
     """
@@ -416,7 +417,7 @@ def _as_calibrated(result: Record, problem: Problem) -> Problem:
 
 
 def _calibrated_point(result: Record, problem: Problem) -> NDArray[np.float64]:
-    """The calibrated values in the search space [d], with the scene's constants that vary in the draws."""
+    """The calibrated values in the search space [d], including the scene's constants that vary in the draws."""
     scene = dict(zip(problem.parameters.names, problem.parameters.start, strict=True))
     return problem.parameters.to_search(np.array([*(scene | result.parameters).values()]))
 
@@ -454,25 +455,25 @@ def _table(
                     gain.append(
                         f"right range of {name} known with probability {percent(probability)} (now {percent(before)})"
                     )
-    table["gain"] = [", ".join(gain) or "no interval narrower by more than 2 %" for gain in gains]
+    table["gain"] = [", ".join(gain) or "no interval narrows by more than 2 %" for gain in gains]
     return pd.DataFrame(table)
 
 
 def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
-    """The gain from an observable, as text."""
+    """Describe the gain from an observable in words."""
     gains = [
         f"{name} to {ratio:.2g} of its width"
         for name, ratio in zip(result.study.parameters, narrowed, strict=False)
         if ratio < 1 - LEAST_GAIN
     ]
-    return ", ".join(gains) or "no interval narrower by more than 2 %"
+    return ", ".join(gains) or "no interval narrows by more than 2 %"
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:
-    """Width of a parameter's interval if the draws are narrowed by a factor, on the scale of the search.
+    """Width of a parameter's interval if the draws narrow by a factor on the scale used for the search.
 
-    The draws apply to the buildings on the links' paths. A measurement does not show how much other buildings differ,
-    so this part of the width remains.
+    The draws apply only to the buildings on the links' paths. A measurement does not show how much other buildings
+    differ, so that part of the width remains.
     """
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)
