@@ -255,7 +255,7 @@ def test_a_model_that_predictions_do_not_use_yet_is_named(folder, ran, tmp_path)
     out = folder / "out"
     used = Result.load(out).prediction.model.name
     other = next(name for name in (Model.INITIAL, Model.LOG_DISTANCE) if name != used)
-    assert f"the model {str(other)!r} is chosen, but predictions do not use it yet" in _unused_text(
+    assert f"the model {str(other)!r} is chosen, but predictions do not use this model yet" in _unused_text(
         out, other
     )
     assert _unused_text(out, used) == _unused_text(tmp_path, other) == ""

@@ -240,7 +240,7 @@ def edited(folder, **changes):
             },
             "verdict = 'x'",
         ),
-        ({"version": 2}, "has version 2, must be 1"),
+        ({"version": 2}, "has version 2, but must have version 1"),
         ({"study__version": 7}, "study files of version 1"),
     ],
 )
@@ -363,7 +363,7 @@ def test_a_validation_of_a_finished_result_changes_no_prediction_and_no_sentence
     text = " ".join([*(part.text for part in summary(validated)), *map(str, validated.validation.summary())])
     assert "Predictions and maps use the model 'calibrated'" in text
     assert "predictions use the model 'initial materials'" not in text.lower()
-    assert "'initial materials' is chosen, but predictions do not use it yet" in text
+    assert "'initial materials' is chosen, but predictions do not use this model yet" in text
     unjudged = replace(result.uncertainty, remarks=(Remark(RemarkKind.NOT_JUDGED),))
     assert NOT_JUDGED in replace(result, uncertainty=unjudged).remarks
     assert NOT_JUDGED not in replace(validated, uncertainty=unjudged).remarks

@@ -105,7 +105,7 @@ def test_as_many_unknowns_as_links_leave_the_whole_range(tmp_path, noisy):
         assert [interval.lower, interval.upper] == planted.BOUNDS
         assert interval.standard_error == pytest.approx(np.ptp(planted.BOUNDS) / np.sqrt(12.0))
         assert interval.label == "not identifiable"
-        assert reason_text(interval.reason) == "12 links are too few for this number of unknowns"
+        assert reason_text(interval.reason) == "too few links (12) for this number of unknowns"
 
 
 def test_an_undeclared_offset_gives_a_warning(tmp_path, noisy, result):

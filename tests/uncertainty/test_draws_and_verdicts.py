@@ -54,7 +54,7 @@ def test_an_undetermined_parameter_covers_its_bounds():
     draws = normal_draws([3.0, None], [0.2, None])
     judged = verdicts(draws, lambda x: x[:, :1], Axes(NAMES, lower, upper), 1.0)
     assert [verdict.name for verdict in judged] == ["identified", "not identifiable"]
-    assert reason_text(judged[1].reason) == "no link's path loss depends on it"
+    assert reason_text(judged[1].reason) == "no link's path loss depends on this parameter"
     little = Reason(ReasonKind.NO_EFFECT, {"change_db": 0.01})
     assert reason_text(little) == "no link's path loss changes by more than 0.1 dB over the whole range"
     assert judged[0].lower == pytest.approx(3.0 - 1.96 * 0.2, abs=0.08)

@@ -102,7 +102,7 @@ def test_too_few_calls_give_the_whole_range(asked):
         assert [found.lower, found.upper] == planted.BOUNDS
         assert found.verdict == "not identifiable"
         assert found.approximate, name
-        assert reason_text(found.reason).startswith("3 calls of the engine are too few")
+        assert reason_text(found.reason).startswith("too few engine calls (3)")
 
 
 def test_calls_that_do_not_predict_one_another_give_the_whole_range(asked):

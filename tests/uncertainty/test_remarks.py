@@ -81,7 +81,7 @@ def test_values_as_probable_as_any_are_not_called_less_probable(log_odds):
 
 def test_a_cause_without_its_own_sentence_is_another_noise_model():
     text = remarks(dict.fromkeys(NAMES, 4.0), noise={"logistic": 0.9, CORRELATED: 0.1, "offset": 1.0})[0]
-    assert "because their noise model differs from the one that the RMSE assumes" in text
+    assert "because the noise model of the intervals differs from that of the RMSE" in text
 
 
 def test_noise_that_the_data_favour_is_reported():

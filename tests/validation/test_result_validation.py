@@ -52,7 +52,7 @@ def test_a_validation_is_read_back(validation, tmp_path):
     ("change", "words"),
     [
         (lambda content: content.update(version=9), "version 9"),
-        (lambda content: content["links"]["block"].pop(), "block must have a value for each of the 60 links"),
+        (lambda content: content["links"]["block"].pop(), "block must have one value per link"),
         (lambda content: content["links"].update(block=[7] * LINKS), "blocks or positions"),
         (lambda content: content["links"]["errors_db"][Model.CALIBRATED].__setitem__(20, None), "is missing"),
         (lambda content: content["links"].update(errors_db={}), "is not a validation"),
@@ -76,7 +76,7 @@ def test_a_validation_of_another_study_or_of_other_measurements_is_refused(valid
     content = STUDY.content()
     content["scene"]["frequency"] = 7e9
     for study, measured in ((Study.from_content(content), MEASURED), (STUDY, MEASURED + 0.1)):
-        with pytest.raises(InputError, match="belongs to a different study or different measurements"):
+        with pytest.raises(InputError, match="does not belong to the study and the measurements"):
             read_validation(tmp_path, study, measured)
 
 

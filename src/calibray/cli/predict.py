@@ -250,8 +250,7 @@ def suggest(
     model = str(result.prediction.model.name)
     echo(
         "Note: the path loss shown is the mean over the draws of the calibrated model; `calibray predict`, which uses "
-        "the model "
-        f"{model!r}, may give other values.",
+        f"the model {model!r}, may give other values.",
         err=True,
     )
     if options.out is not None:

@@ -217,7 +217,8 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     south, north = coverage.y[0] - half, coverage.y[-1] + half
     finite = np.where(np.isfinite(values), values, np.nan)
     low, high = _range(finite)
-    label += f"\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);\nvalues outside this range have the end colours"
+    label += f"\ncolours: {low:.3g} to {high:.3g} (2 % to 98 % quantile);"
+    label += "\nvalues outside this range have the end colours"
     axes.set_facecolor(LINE)
     image = axes.imshow(
         finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,

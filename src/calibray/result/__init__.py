@@ -1,4 +1,4 @@
-"""The record of a finished calibration: sections of plain data, their files, and their wording."""
+"""The record of a finished calibration: plain data in sections, the result files, and the text that describes them."""
 
 from calibray.result.files import FILES
 from calibray.result.held_out import FittedTerm, HeldOutErrors, Judgement, PredictionModel, ResidualField

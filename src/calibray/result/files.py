@@ -1,4 +1,4 @@
-"""Write, read and validate the files of a result; each file is written completely or not at all."""
+"""Write, read and check the files of a result; each file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ VERSION: Final = 1
 """Version of the format of `result.json`."""
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
-"""Files of a result. The prefix distinguishes them from a user's own links.csv and scene.xml."""
+"""Files of a result. The prefix distinguishes these files from a user's own links.csv and scene.xml."""
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)
@@ -67,18 +67,18 @@ LINKS: Final = {
 }  # fmt: skip
 HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f", "seconds": "f"}
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
-"""Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
+"""Columns of each file, with the NumPy kind of their values: integer, float or Boolean."""
 
 OPTIONAL: Final = ("leverage", "depth", "out_of_sight", "obstruction_m", "region_m")
 """Optional numeric columns."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
-"""Columns that contain only finite values; in other columns, the value of a link without a path can be infinite or
+"""Columns that contain only finite values; in other columns, the value for a link without a path can be infinite or
 empty."""
 
 
 class LinkCounts(Section):
-    """Numbers of links, for human readers; see `Record.counts`. `read` ignores this section."""
+    """Numbers of links, stored for human readers; see `Record.counts`. `read` ignores this section."""
 
     calibrated_on: Count
     held_out: Count
@@ -90,7 +90,8 @@ class LinkCounts(Section):
 class Stored(Section):
     """The content of `result.json`: the sections of a `Record`.
 
-    `study_from_here` is the path of the study file relative to the result's folder, so that both can be moved together.
+    `study_from_here` is the path of the study file relative to the result's folder, so that the study and the folder
+    can be moved together.
     """
 
     version: Literal[1]
@@ -115,9 +116,9 @@ SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "
 def content(
     record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
 ) -> dict[str, Any]:
-    """The content of `result.json`: all sections of a result except its tables, and its remarks as sentences.
+    """The content of `result.json`: all sections of a result except its tables, and the remarks as sentences.
 
-    `files` contains the SHA-256 digests of the other files of the result, by name, if these are already written.
+    `files` contains the SHA-256 digests of the result's other files, by name, if these files are already written.
     """
     parts = {name: getattr(record, name) for name in SECTIONS}
     values = {name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in parts.items()}
@@ -140,11 +141,12 @@ def write(
     sentences: tuple[str, ...] = (),
     validation: dict[str, Any] | None = None,
 ) -> None:
-    """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
+    """Write `result.json`, the tables, the calibrated scene and, if there is one, the validation.
 
-    Each file is written under a temporary name and then renamed, so every file is complete or absent. `result.json` is
-    written last and contains the digests of the other files, so `read` rejects a mixture of two runs if a run is killed
-    before that. `sentences` and the figures in `validation` are for human readers; `read` ignores them.
+    Each file is written under a temporary name and then renamed, so every file is either complete or absent.
+    `result.json` is written last and contains the digests of the other files. If a run is killed earlier, `read`
+    therefore rejects the mixture of two runs. `sentences` and the numbers in `validation` are for human readers; `read`
+    ignores both.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced.
@@ -184,7 +186,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
     Raises:
         InputError: The folder contains no result, a result of a different version, a damaged or edited result, or files
-            of several runs.
+            from several runs.
     """
     source = as_path(folder, "result") / RESULT_FILE
     if source.parent.is_file():
@@ -207,13 +209,13 @@ def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> 
         file = folder / name
         if name not in digests:
             raise InputError(f"{folder / RESULT_FILE}: files.{name} is missing; run the study again")
-        # Nothing is read from the scene file, so it may be absent.
+        # Nothing is read from the scene file, so this file may be absent.
         if not exists(file) or file_digest(file) == digests[name]:
             continue
         if is_unchanged_output(file):
             raise InputError(
                 f"{file}: belongs to a different run from {RESULT_FILE}, because a run into this folder was "
-                "interrupted or files were copied; run the study again"
+                "interrupted, or because files were copied; run the study again"
             )
         if not allow_edits:
             raise InputError(
@@ -233,7 +235,8 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
         raise InputError(f"{source}: must contain a JSON object; run the study again")
     if values.get("version") != VERSION:
         raise InputError(
-            f"{source}: has version {shortened(repr(values.get('version')))}, must be {VERSION}; run the study again"
+            f"{source}: has version {shortened(repr(values.get('version')))}, but must have version {VERSION}; run the "
+            "study again"
         )
     try:
         # In JSON mode Pydantic accepts lists as tuples and converts nothing else.
@@ -243,7 +246,8 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
     except ValidationError as error:
         refusal = explain(error, Stored, values, str(source))
         raise refusal from None
-    # A study that was moved or copied together with the result takes precedence, because its files are next to it.
+    # If the study was moved or copied together with the result, that copy takes precedence, because its files are next
+    # to it.
     near = Path(os.path.normpath(source.parent.resolve() / stored.study_from_here))
     study = Study.from_content(
         stored.study, near if stored.study_from_here and exists(near) else stored.study_file
@@ -310,18 +314,19 @@ def check_same_study(study: Study, folder: Path) -> None:
         _, calibrated = _read_stored(folder / RESULT_FILE)
         if _problem_digest(study) != _problem_digest(calibrated):
             raise InputError(
-                f"{folder}: its result belongs to another study; give another folder, or run the study again"
+                f"{folder}: the result in this folder belongs to another study; give another folder, or run the study "
+                "again"
             )
 
 
 def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
     """Names of the files of the scene and antennas that have changed since the calibration.
 
-    `files` are the current files with their digests, as in `Setup.files`.
+    `files` contains the current files with their digests, as in `Setup.files`.
     """
     if not result.provenance.files:
         return []
-    # Files are compared by name and content, because the whole folder may have moved.
+    # Files are compared by name and content, because the whole folder may have been moved.
     calibrated, current = (
         sorted((Path(file).name, digest) for file, digest in files.items())
         for files in (result.provenance.files, files)
@@ -330,7 +335,7 @@ def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
 
 
 def has_links(result: Record, links: Measurements) -> bool:
-    """Whether a calibration used these links: their measured values and positions agree to within rounding in files."""
+    """Whether a calibration used these links, judged by measured values and positions (within rounding in files)."""
     table, ends = result.links, result.ends
     pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
     pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]
@@ -340,18 +345,18 @@ def has_links(result: Record, links: Measurements) -> bool:
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
-    """Write the held-out errors of a study to a folder; the figures are for human readers.
+    """Write the held-out errors of a study to a folder; the numbers in `figures` are for human readers.
 
     Raises:
-        InputError: The folder contains a result of another study or of different links, or an unreadable result.
+        InputError: The folder contains an unreadable result, or the result of another study or of different links.
     """
     check_same_study(study, folder)
     if (folder / RESULT_FILE).is_file():
         measured_db = read_rows(folder, LINKS_FILE, LINKS)["measured_db"].to_numpy()
         if not _same(held_out.measured_db, measured_db):
             raise InputError(
-                f"{folder}: its result has different links ({len(measured_db)}, whereas the validation has "
-                f"{len(held_out.measured_db)}); give another folder, or run the study again. If --by separates "
+                f"{folder}: the result in this folder has different links ({len(measured_db)}, whereas the validation "
+                f"has {len(held_out.measured_db)}); give another folder, or run the study again. If --by separates "
                 "rows of one link, also set [holdout] by"
             )
     _write_validation(held_out, study, folder, figures)
@@ -375,16 +380,16 @@ def _write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figur
 
 
 def _rounded(values: NDArray[np.float64]) -> list[float | None]:
-    """Values rounded to 0.0001 dB; None for non-finite values, which JSON cannot express."""
+    """Round values to 0.0001 dB; None replaces non-finite values, which JSON cannot express."""
     return [round(value, 4) if np.isfinite(value) else None for value in values.tolist()]
 
 
 def _problem_digest(study: Study) -> str:
-    """SHA-256 digest of a study without its hold-out, and without method, seed and engine, which `run` can change."""
+    """SHA-256 digest of a study without its hold-out section, method, seed and engine, which `run` can change."""
     content = {
         key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
     }
-    # `Setup.open` adds one parameter per transmitter of a population.
+    # If parameters describe a population, `Setup.open` adds one parameter per transmitter.
     entries = content["parameters"].items()
     content["parameters"] = {
         name: entry for name, entry in entries if not entry.get("prior", {}).get("shared")
@@ -393,7 +398,7 @@ def _problem_digest(study: Study) -> str:
 
 
 def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool:
-    """Whether two arrays of measured path loss [links], [dB], agree to within the rounding of values in files."""
+    """Whether two arrays of measured path loss [links], [dB], agree within the rounding of values in files."""
     return len(first_db) == len(second_db) and bool(np.abs(first_db - second_db).max() <= 1e-3)
 
 
@@ -403,7 +408,7 @@ def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]
     `measured_db` is the measured path loss of the result's links [links], [dB].
 
     Raises:
-        InputError: The file was damaged or edited, or belongs to another study or to different links.
+        InputError: The file is damaged or edited, or belongs to another study or to different links.
     """
     file = folder / VALIDATION_FILE
     if not file.is_file():
@@ -416,11 +421,11 @@ def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{file}: is not a validation written by `calibray validate` ({error}); validate again"
+            f"{file}: is not a validation file written by `calibray validate` ({error}); validate again"
         ) from None
     if not belongs or not _same(held_out.measured_db, measured_db):
         raise InputError(
-            f"{file}: belongs to a different study or different measurements from {RESULT_FILE}; run the study again, "
+            f"{file}: does not belong to the study and the measurements of {RESULT_FILE}; run the study again, "
             "or remove the file and validate again"
         )
     return held_out
@@ -442,9 +447,7 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
     lengths = {"block": len(block), "position": len(position), "measured_db": len(held_out.measured_db)}
     lengths |= {name: len(errors) for name, errors in held_out.errors.items()}
     if wrong := [name for name, length in lengths.items() if length != links]:
-        raise InputError(
-            f"{file}: {wrong[0]} must have a value for each of the {links} links; validate again"
-        )
+        raise InputError(f"{file}: {wrong[0]} must have one value per link ({links}); validate again")
     judged = block >= 0
     if position.shape != (links, 3) or not judged.any() or block.max() >= len(held_out.labels):
         raise InputError(f"{file}: blocks or positions are invalid; validate again")
@@ -452,7 +455,7 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
         raise InputError(f"{file}: an error of a judged link is missing; validate again")
     if not {Model.INITIAL, Model.CALIBRATED} <= set(held_out.errors):
         raise InputError(
-            f"{file}: is not a validation written by `calibray validate` (a model is missing); validate again"
+            f"{file}: is not a validation file written by `calibray validate` (a model is missing); validate again"
         )
     if not 0 < held_out.level < 1:
         raise InputError(f"{file}: level = {held_out.level:g}: must be between 0 and 1; validate again")
@@ -460,7 +463,7 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
 
 
 def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
-    """Read a table from a result's folder, and check the required columns against their kinds: "i", "f" or "b".
+    """Read a table from a result's folder, and check that required columns have the stated kind: "i", "f" or "b".
 
     Raises:
         InputError: The file does not exist, lacks a column, or has invalid values in a column.
@@ -469,7 +472,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     if not exists(file):
         raise InputError(f"{file}: does not exist; give the --out folder of `calibray run`")
     try:
-        # Group labels such as 7 or NA must stay text.
+        # Group labels such as 7 or NA must remain text.
         table = pd.read_csv(file, converters={"group": without_formula_mark})
     except (OSError, ValueError) as error:
         raise InputError(

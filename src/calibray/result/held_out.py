@@ -1,4 +1,4 @@
-"""Held-out errors: residuals of several models on links to which none of them was fitted."""
+"""Held-out errors: residuals of several models on links to which none of the models was fitted."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Model(StrEnum):
 
 
 WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
-"""Models that use no paths; the second model uses the walls and roofs of the scene."""
+"""Models that use no paths; the second of them uses the walls and roofs of the scene."""
 
 BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models without calibrated materials."""
@@ -43,9 +43,9 @@ FITTED: Final = (Model.CALIBRATED, Model.PRIOR, Model.OFFSETS)
 
 
 class Average(NamedTuple):
-    """The two models whose path loss an average combines, and the weight of the first one.
+    """The two models whose path loss is averaged, and the weight of the first model.
 
-    If an average is chosen, an exported scene has the materials of the first model.
+    If an average is chosen for predictions, an exported scene has the materials of the first model.
     """
 
     first: Model
@@ -53,7 +53,7 @@ class Average(NamedTuple):
     weight: float = 0.5
 
     def of(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The weighted mean of the values of both models [n]."""
+        """The weighted mean of the values from both models [n]."""
         return self.weight * first + (1.0 - self.weight) * second
 
 
@@ -79,7 +79,7 @@ AVERAGE_OF: Final[dict[str, Model]] = {
 
 @dataclass(frozen=True)
 class ObservableErrors:
-    """Held-out errors of a further observable, in its unit.
+    """Held-out errors of a further observable, in the unit of the observable.
 
     Attributes:
         unit: The unit.
@@ -98,7 +98,7 @@ class ObservableErrors:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Residuals of several models on the same links, where each link is predicted by models fitted without its block.
+    """Residuals of several models on the same links; the models that predict a link were fitted without its block.
 
     Attributes:
         labels: Names of the blocks.
@@ -108,7 +108,7 @@ class HeldOutErrors:
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
         observables: Errors of the further observables by name; empty in a loaded result, where `Accuracy` contains
-            them.
+            these errors.
     """
 
     labels: tuple[str, ...]
@@ -122,7 +122,7 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class Judgement:
-    """Comparison of the calibrated model with the best baseline, on links to which neither was fitted.
+    """Comparison of the calibrated model with the best baseline, on links to which neither model was fitted.
 
     Attributes:
         links: Number of links.
@@ -150,7 +150,7 @@ class Judgement:
         """Whether the gain is significantly greater than zero (Student's t, clusters - 1 degrees of freedom)."""
         if self.error_db is None:
             return False
-        # Clusters are resampled to compute the standard error, so they determine its degrees of freedom.
+        # The standard error is computed by resampling clusters, so their number determines its degrees of freedom.
         return self.gain_db > float(stdtrit(max(self.clusters - 1, 1), (1 + CONFIDENCE) / 2)) * self.error_db
 
 
@@ -158,7 +158,7 @@ NO_PATH: Final = "no path"
 """Beginning of the text in the column `basis` of predictions for links without a path."""
 
 NEW_GROUP: Final = "group without measurements"
-"""Part of the text in the column `basis` of predictions for links whose offset is the mean of the measured groups."""
+"""Part of the text in the column `basis` of predictions that use the mean offset of the measured groups."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,8 @@ class FittedTerm:
     Attributes:
         name: Name of the term.
         by: Column of the term: "constant", "log_distance", or a column of the links' table.
-        per: Groups of the term: "offset" for the groups of the study's offset, "transmitter", a column, or "" for none.
+        per: Groups of the term: "offset" for the groups of the study's offset, "transmitter", a column, or "" for no
+            groups.
         coefficients: Coefficient by group, [dB] per unit of the column; for other groups, the mean of these
             coefficients is used.
         centre: Value that is subtracted from the column.
@@ -193,7 +194,7 @@ class BlockErrors:
         between_db: Standard deviation of the error that the links of a new block have in common [dB].
         blocks: Number of blocks.
         reach_m: 90 % quantile of the distance from a held-out link to the nearest calibration link [m].
-        groups_db: RMS contribution to these errors from the random effects of groups that occur in only one block [dB].
+        groups_db: RMS contribution of random effects to these errors, for groups that occur in only one block [dB].
         out_of_sight: RMS error of links out of sight divided by that of all links; at least 1.
     """
 
@@ -207,17 +208,18 @@ class BlockErrors:
 
 @dataclass(frozen=True)
 class PredictionModel:
-    """A model that is fitted to the calibration links, and its errors on new links.
+    """A model fitted to the calibration links, with its errors on new links.
 
     Attributes:
         name: Name of the model; see `held_out.Model`.
         parameters: Values of the parameters, in their units; None if the model uses no scene.
         terms: Nuisance terms of the model.
-        residual_db: RMS of the model's residuals on new links [dB]; None if there are too few links.
+        residual_db: RMS of the model's residuals on new links [dB]; None if there are too few links to estimate it.
         basis: Description of the links on which these residuals were computed.
-        links: Number of these links; if they are calibration links, the degrees of freedom.
-        sizes_db: Absolute held-out residuals, ascending [dB]; 400 quantiles if there are more than 400 residuals.
-        blocks: Standard deviations of these residuals at two levels; None if too few links were held out.
+        links: Number of these links; if these are calibration links, the number of degrees of freedom.
+        sizes_db: Absolute held-out residuals, ascending [dB]; if there are more than 400, 400 quantiles of the
+            residuals.
+        blocks: Standard deviations of these residuals within and between blocks; None if too few links were held out.
         averaged: Second set of parameter values, if path loss is the average over two sets; otherwise None.
     """
 
@@ -237,7 +239,7 @@ class ResidualField:
     """The spatially correlated part of the residuals; see `prediction.corrections`.
 
     Attributes:
-        range_m: Distance at which the correlation is 1/e [m].
+        range_m: Distance at which the correlation has fallen to 1/e [m].
         shared_db: Standard deviation of the correlated part [dB].
         own_db: Standard deviation of the uncorrelated part [dB].
     """

@@ -27,7 +27,7 @@ from calibray.study import Study
 from calibray.support.messages import type_name
 from calibray.tracing.protocol import EnclosedAntennas
 
-# When `files` reads the sections, Pydantic validates them, including these numeric bounds.
+# When `files` reads the sections, Pydantic validates their values, including these numeric bounds.
 NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
 Offset = Annotated[float, Field(ge=-500, le=500)]
@@ -46,8 +46,8 @@ class ObservableFit:
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
         mean_rmse: RMSE of a baseline that predicts the mean value for every link.
-        error: Standard deviation of the error of a measured value, stated or estimated.
-        biases: Bias by group; the group "" contains all links.
+        error: Standard deviation of the error of a measured value, either stated in the study or estimated.
+        biases: Device bias by group; the group "" contains all links.
         bias_errors: Standard error of each bias, including the uncertainty of the parameters.
     """
 
@@ -69,16 +69,16 @@ class Fit:
     Attributes:
         parameters: Calibrated values by parameter, in the units of the parameters.
         initial_parameters: Values before calibration.
-        materials: All materials of the scene at the study's carrier, with the calibrated values.
+        materials: All materials of the scene at the study's carrier frequency, with the calibrated values.
         laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, for laws with a calibrated coefficient.
         rmse_db: RMSE over the calibration links (paper eq. 1) [dB].
-        initial_rmse_db: RMSE with the initial materials and no nuisance [dB].
+        initial_rmse_db: RMSE with the initial materials and without nuisances [dB].
         nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None if there are no
             nuisances.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
         retrace_gap_db: Largest change in a calibration link's path loss when the scene is traced again with the
             calibrated materials [dB]; None if the paths do not depend on the materials.
-        power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths without
+        power_shares: Share of the links' power by material and type of interaction; "line of sight" for paths without
             interactions. The shares can add up to more than 1, because a path contributes to the share of each of its
             interactions.
         observables: Accuracy of the calibrated model for the further observables, by name.
@@ -103,7 +103,7 @@ class Accuracy:
 
     Attributes:
         holdout_rmse_db: RMSE of the calibrated model [dB].
-        initial_holdout_rmse_db: RMSE with the initial materials and no nuisance [dB].
+        initial_holdout_rmse_db: RMSE with the initial materials and without nuisances [dB].
         nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
         log_distance_holdout_rmse_db: RMSE of the log-distance model fitted to the calibration links [dB].
         judgement: Comparison of the calibrated model with the best baseline.
@@ -124,12 +124,12 @@ class Uncertainty:
 
     Attributes:
         intervals: 95 % interval and verdict by parameter.
-        draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty if there are none.
-        constants_db: Constants that the scene fixes and that vary in the draws, each with the change in path loss per
+        draws: Posterior draws by parameter, constant and nuisance coefficient; empty if there are no draws.
+        constants_db: Constants that are fixed in the scene but vary in the draws, each with the change in path loss per
             standard deviation of the constant [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
-        undeclared_offset_db: Best-fitting offset if the study declares no offset [dB]; None if it was not estimated.
-        undeclared_offset_error_db: Standard error of this offset [dB].
+        undeclared_offset_db: Best-fitting offset if the study declares no offset [dB]; None if no offset was estimated.
+        undeclared_offset_error_db: Standard error of the undeclared offset [dB].
         remarks: Warnings and advice.
     """
 
@@ -149,7 +149,7 @@ class Nuisance:
     Attributes:
         coefficients: Coefficient by term and group, [dB] per unit of the term's column; the offset is the term
             "offset", and the group "" contains all links.
-        centres: Value that is subtracted from the term's column, by term.
+        centres: Value that is subtracted from a term's column, by term.
         groups_without_path: Groups without an offset, because none of their calibration links has a path.
     """
 
@@ -165,13 +165,13 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The model used for predictions, maps, exports and the report.
+    """The model that is used for predictions, maps, exports and the report.
 
     Attributes:
-        model: The prediction model: chosen by errors on held-out links, or the calibrated model if too few links are
-            held out.
-        materials: All materials of the scene at the study's carrier, with the values of the model's parameters; None if
-            the model uses no scene.
+        model: The prediction model, chosen by errors on held-out links; the calibrated model if too few links are held
+            out.
+        materials: All materials of the scene at the study's carrier frequency, with the model's parameter values; None
+            if the model uses no scene.
         residual_field: The spatially correlated part of the residuals; None if the residuals are uncorrelated.
         fallback: The model for links without a path; None if the model uses no scene, or the study states a ceiling.
     """
@@ -187,15 +187,15 @@ class Cost:
     """Numbers of RT calls and replays, and computing times.
 
     Attributes:
-        rt_calls: RT calls of the method, including those found in the ledger.
-        ledger_hits: RT calls that were found in the ledger.
+        rt_calls: Number of RT calls of the method, including those found in the ledger.
+        ledger_hits: Number of RT calls that were found in the ledger.
         seconds: Time taken by the method, excluding tracing [s].
-        trace_seconds: Time taken to trace and load before the search [s].
+        trace_seconds: Time taken to trace, or to load traced paths, before the search [s].
         uncertainty_replays: Number of replays for intervals and draws.
         uncertainty_seconds: Time taken to compute intervals and draws [s].
         cheap_replays: Number of replays of the cheap model, which are not RT calls.
         cheap_seconds: Time taken by the replays of the cheap model [s].
-        total_seconds: Time taken by the whole calibration, with validation [s]; 0 if unknown.
+        total_seconds: Time taken by the whole calibration, including validation [s]; 0 if unknown.
     """
 
     rt_calls: Count
@@ -215,8 +215,9 @@ class Provenance:
 
     Attributes:
         files: SHA-256 of every file of the scene and the antennas, by path; empty if unknown.
-        rows: Numbers of rows that were left out, averaged or moved when links were made from them, by cause.
-        enclosed: Antennas inside closed bodies of the scene or below the ground; None if this was not checked.
+        rows: Numbers of table rows that were left out, averaged or moved when the rows were converted to links, by
+            cause.
+        enclosed: Antennas inside closed bodies of the scene or below the ground; None if antennas were not checked.
     """
 
     files: dict[str, Digest] = field(default_factory=dict)
@@ -226,7 +227,7 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Record:
-    """The data of a finished calibration. This class is abstract; `calibration.result.Result` is the final class.
+    """The data of a finished calibration. This class is abstract; `calibration.result.Result` is the class to use.
 
     Attributes:
         study: The study, with the method, seed and engine that were used.
@@ -237,14 +238,15 @@ class Record:
         prediction: The model that predictions use.
         cost: RT calls, replays and time.
         provenance: The inputs of the calibration.
-        links: One row per link, with its row in the source file, has_path, held_out, and the positions tx_x to rx_z
-            [m]. Path loss [dB] is listed as measured, before and after calibration, by the log-distance model, by the
-            prediction model (by the fallback for links without a path), and by the scene of the prediction model alone.
-            Another column contains the change in path loss when the scene is traced again [dB]. If applicable, further
-            columns are group, frequency [Hz], path loss with the nuisances alone [dB], values in the measured quantity,
-            leverage, depth, and whether the link is censored or near the noise floor.
-        history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
-        held_out: Held-out errors of every model, if blocks were held out in turn; None otherwise.
+        links: One row per link, with its row number in the source file, has_path, held_out, and the positions tx_x to
+            rx_z [m]. Path loss [dB] is listed as measured, as modelled before and after calibration, as predicted by
+            the log-distance model and by the prediction model (for links without a path, by the fallback), and as
+            computed from the scene of the prediction model alone. Another column contains the change in path loss when
+            the scene is traced again [dB]. If applicable, further columns are group, frequency [Hz], path loss with the
+            nuisances alone [dB], values in the measured quantity, leverage, depth, and whether the link is censored or
+            near the noise floor.
+        history: One row per RT call: number, iteration, RMSE, lowest RMSE so far, seconds since the start.
+        held_out: Held-out errors of every model, if blocks were held out in turn; otherwise None.
         scene: The scene as it was read; None in a loaded result.
         paths: The paths that were replayed, for drawing; None in a loaded result.
     """
@@ -270,7 +272,7 @@ class Record:
 
     @property
     def materials(self) -> dict[str, Material]:
-        """All materials of the scene at the study's carrier, with the calibrated values."""
+        """All materials of the scene at the study's carrier frequency, with the calibrated values."""
         return self.fit.materials
 
     @property
@@ -280,18 +282,18 @@ class Record:
 
     @property
     def ends(self) -> NDArray[np.float64] | None:
-        """Positions of transmitter and receiver of every link [links, 6], [m]; None if unknown."""
+        """Positions of the transmitter and the receiver of every link [links, 6], [m]; None if unknown."""
         return ends_of(self.links)
 
     @property
     def scene_materials(self) -> dict[str, Material]:
-        """The exported materials: those of the prediction model, or the calibrated ones if it uses no scene."""
+        """The materials to export: those of the prediction model or, if it uses no scene, the calibrated materials."""
         return self.materials if self.prediction.materials is None else self.prediction.materials
 
     @property
     def scene_laws(self) -> dict[str, dict[str, float]]:
         """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, for the constants of `scene_materials`."""
-        # The values of the prediction model may differ from the calibrated ones.
+        # The values of the prediction model may differ from the calibrated values.
         values = self.prediction.model.parameters or {}
         return {
             material: {name: values.get(f"{material}.{name}", value) for name, value in law.items()}
@@ -305,28 +307,28 @@ class Record:
 
     @property
     def initial_rmse_db(self) -> float:
-        """RMSE over the calibration links with the initial materials and no nuisance [dB]."""
+        """RMSE over the calibration links with the initial materials and without nuisances [dB]."""
         return self.fit.initial_rmse_db
 
     @property
     def holdout_rmse_db(self) -> float | None:
-        """RMSE over the held-out links [dB]; None if there are none."""
+        """RMSE over the held-out links [dB]; None if no link is held out."""
         return self.accuracy.holdout_rmse_db
 
     @property
     def rt_calls(self) -> int:
-        """RT calls of the method, including those found in the ledger."""
+        """Number of RT calls of the method, including those found in the ledger."""
         return self.cost.rt_calls
 
     @property
     def counts(self) -> dict[str, Any]:
-        """Numbers of links, and rows with possible problems.
+        """Numbers of links, and the rows with possible problems.
 
         Held-out links are counted only if the hold-out RMSE includes them.
         """
         has_path = self.links["has_path"].to_numpy(bool)
         held_out = self.links["held_out"].to_numpy(bool)
-        # As in the objective, where a ceiling replaces a missing path.
+        # As in the objective, links without a path are used if a ceiling replaces the missing path loss.
         usable = has_path | (self.study.objective.no_path == "censor")
         if "faint" in self.links:
             usable &= ~self.links["faint"].to_numpy(bool)
@@ -344,7 +346,7 @@ def check_record(result: object) -> None:
     """Refuse anything but a result.
 
     Raises:
-        InputError: The object is not a result but, for example, a study.
+        InputError: The object is not a result; it may be a study, for example.
     """
     if not isinstance(result, Record):
         raise InputError(

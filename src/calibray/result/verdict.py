@@ -1,4 +1,4 @@
-"""Verdicts on parameters, as data; `wording` converts them to sentences."""
+"""Verdicts on parameters, as data; the module `wording` converts verdicts to sentences."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import Final
 
 CONFIDENCE: Final = 0.95
-"""Probability of the intervals in a result."""
+"""Nominal probability that an interval in a result contains the true value."""
 
 
 class Verdict(StrEnum):
@@ -57,7 +57,7 @@ class Reason:
     Attributes:
         kind: The kind of reason.
         values: Numbers and names for the sentence; see `ReasonKind`.
-        ranges: Ranges or modes in the sentence; the last number of each is its weight.
+        ranges: Ranges or modes in the sentence; the last number of each range or mode is its weight.
     """
 
     kind: ReasonKind
@@ -67,20 +67,21 @@ class Reason:
 
 @dataclass(frozen=True)
 class Interval:
-    """The 95 % interval of one parameter, with its verdict.
+    """The 95 % interval of a parameter, with the verdict on the parameter.
 
     Attributes:
         standard_error: Standard error from the curvature of the sum of squares at the optimum, in the parameter's unit.
-        lower: Lower end of the 95 % interval, within the bounds; with several pieces, that of the lowest piece.
-        upper: Upper end of the interval; with several pieces, that of the highest piece.
+        lower: Lower end of the 95 % interval, within the bounds; if the interval has several pieces, the lower end of
+            the lowest.
+        upper: Upper end of the interval; if the interval has several pieces, the upper end of the highest.
         verdict: The verdict on the parameter.
         pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
         reason: The reason for the verdict.
         approximate: Whether the interval comes from an emulator, because the engine provides no derivatives.
-        seen: Pieces of the 95 % interval for the buildings on the links' paths alone, which apply to predictions. Empty
-            if they equal the pieces for the mean over all buildings of this material.
-        without: Share of the width that would remain if a cause were ruled out, by cause; only for causes with a
-            noticeable effect.
+        seen: Pieces of the 95 % interval for only the buildings on the links' paths; these pieces apply to predictions.
+            The tuple is empty if these pieces equal those for the mean over all buildings of this material.
+        without: Share of the width that would remain if a cause were ruled out, by cause; causes with little effect are
+            omitted.
     """
 
     standard_error: float

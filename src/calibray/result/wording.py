@@ -1,4 +1,4 @@
-"""The sentences of a result for the terminal, the page and JSON. This module converts the statistics to text."""
+"""The sentences that describe a result on the terminal, on the report page and in JSON."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from calibray.support.messages import counted, percent
 from calibray.tables import rows_text
 
 MOST_ODDS: Final = 1000.0
-"""Largest odds that are reported as a number."""
+"""Maximum odds that are reported as a number."""
 
 CLEAR_ODDS: Final = 2.0
-"""Odds below which two candidates are considered about equally probable. The log densities of draws of one Gaussian
+"""Odds below which two candidates count as about equally probable. The log densities of draws of one Gaussian
 parameter have a standard deviation of sqrt(1/2), nearly ln 2."""
 
 SHOWN_PIECES: Final = 3
-"""Largest number of pieces of an interval that are listed one by one."""
+"""Maximum number of interval pieces that are listed one by one."""
 
 SHOWN_GROUPS: Final = 4
-"""Largest number of groups that a remark lists."""
+"""Maximum number of groups that a remark lists."""
 
 UNKNOWN_BEST: Final = (
     "Errors on held-out links are unknown, so it is unclear which model predicts new links best."
@@ -31,21 +31,22 @@ NOT_JUDGED: Final = f"{UNKNOWN_BEST} Set [holdout] blocks = 4, or run calibray v
 
 
 def interval_text(interval: Interval) -> str:
-    """The ends of an interval, or of each piece if there are few, such as "2.1 to 3.4"."""
+    """The ends of an interval, or of each piece if there are few pieces, such as "2.1 to 3.4"."""
     hull = ((interval.lower, interval.upper),)
     pieces = interval.pieces if 1 < len(interval.pieces) <= SHOWN_PIECES else hull
     return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
 
 
 def reason_text(reason: Reason | None) -> str:
-    """The reason for a verdict as a clause without a full stop; empty if there is none."""
+    """The reason for a verdict, as a clause without a full stop; empty if there is no reason."""
     return "" if reason is None else _REASONS[reason.kind](reason.values, reason.ranges)
 
 
 def explanation_text(interval: Interval) -> str:
     """The reason for a verdict, and the assumptions that would narrow the interval.
 
-    The text consists of clauses without a full stop. It is empty if there are none.
+    The text consists of clauses without a full stop. The text is empty if there is neither a reason nor such an
+    assumption.
     """
     clauses = [reason_text(interval.reason)]
     if interval.seen:
@@ -102,30 +103,30 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.NO_EFFECT: lambda values, _: (
         f"no link's path loss changes by more than {max(values['change_db'], 0.1):.1f} dB over the whole range"
         if values["change_db"]
-        else "no link's path loss depends on it"
+        else "no link's path loss depends on this parameter"
     ),
     ReasonKind.TRADE_OFF: lambda values, _: (
-        f"it trades off with {values['parameter']} (rank correlation {values['correlation']:.2f})"
+        f"the value trades off with {values['parameter']} (rank correlation {values['correlation']:.2f})"
     ),
     ReasonKind.CONFOUNDED: lambda values, _: (
         f"path loss changes by up to {values['change_db']:.1f} dB over the range, but other unknowns can compensate: "
         "an offset, or errors shared by links"
     ),
     ReasonKind.NOISE: lambda values, _: (
-        f"path loss changes by up to {values['change_db']:.1f} dB over the range, too little compared with noise of "
-        f"{values['noise_db']:.1f} dB"
+        f"path loss changes by up to {values['change_db']:.1f} dB over the range, which is too little compared with "
+        f"the noise of {values['noise_db']:.1f} dB"
     ),
     ReasonKind.OUTSIDE_INTERVAL: lambda values, _: (
         f"the value with the lowest RMSE, {values['value']:.4g}, is outside the interval"
     ),
     ReasonKind.TOO_FEW_LINKS: lambda values, _: (
-        f"{values['links']:.0f} links are too few for this number of unknowns"
+        f"too few links ({values['links']:.0f}) for this number of unknowns"
     ),
     ReasonKind.TOO_FEW_CALLS: lambda values, _: (
-        f"{values['calls']:.0f} calls of the engine are too few to show how path loss depends on any parameter"
+        f"too few engine calls ({values['calls']:.0f}) to show how path loss depends on any parameter"
         + (
-            f": each call is predicted from the others with an error of {values['error_db']:.2g} dB, and the best RMSE "
-            f"is {values['rmse_db']:.2g} dB; use a larger budget"
+            f": predictions of each call from the others have an error of {values['error_db']:.2g} dB, and the best "
+            f"RMSE is {values['rmse_db']:.2g} dB; use a larger budget"
             if "error_db" in values
             else ""
         )
@@ -143,16 +144,20 @@ def remark_text(remark: Remark) -> str:
     return _REMARKS[remark.kind](remark.values)
 
 
+def _have(count: int) -> str:
+    return "has" if count == 1 else "have"
+
+
 def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
     return lambda values: (
-        f"{finding} (posterior weight {values['weight']:.2f}, versus "
-        f"{values['gaussian_weight']:.2f} for independent Gaussian noise). The intervals account for this."
+        f"{finding} (posterior weight {values['weight']:.2f}, versus {values['gaussian_weight']:.2f} for independent "
+        "Gaussian noise). The intervals account for this."
     )
 
 
 def _errors_out_of_sight(values: dict[str, Any]) -> str:
     text = _noise_remark(
-        "Errors of weak links out of sight are larger than those of other links, as if the scene lacked paths to them"
+        "Errors are larger on weak links out of sight than on other links, as if paths to these links were missing"
     )(values)
     # Results of earlier versions do not list the missing settings.
     lacking = values.get("lacking")
@@ -174,10 +179,10 @@ def _richer_paths(values: dict[str, Any]) -> str:
 
 _CAUSES: Final = {
     "correlated": "neighbouring links have less weight than independent links if they share part of their errors",
-    "out_of_sight": "weak links out of sight have less weight if the scene lacks paths to them",
+    "out_of_sight": "weak links out of sight have less weight if paths to these links are missing",
     "student-t": "outliers have less weight if the noise has heavy tails",
     "heterogeneous": "links that depend on single buildings have less weight if buildings differ",
-    "gaussian": "their noise model differs from the one that the RMSE assumes",
+    "gaussian": "the noise model of the intervals differs from that of the RMSE",
 }
 
 
@@ -196,16 +201,16 @@ def _outside_interval(values: dict[str, Any]) -> str:
     if odds < CLEAR_ODDS:
         text = (
             f"The candidate with the lowest RMSE is outside an interval: {'; '.join(low for low, _ in parameters)}. No "
-            "other candidate is clearly more probable, but few candidates near it fit equally well; most candidates "
-            "that do are inside the intervals."
+            "other candidate is clearly more probable. However, few candidates near this one fit equally well, and "
+            "most candidates that fit equally well are inside the intervals."
         )
     else:
         times = f"more than {MOST_ODDS:,.0f}" if odds >= 0.999 * MOST_ODDS else f"{odds:.2g}"
         text = (
             f"The candidate with the lowest RMSE is not the most probable one: {'; '.join(map(''.join, parameters))}. "
             "The RMSE treats the noise of all links as independent; the intervals do not, because "
-            f"{_CAUSES.get(values['cause'], _CAUSES['gaussian'])}. "
-            f"The most probable values are {times} times as probable."
+            f"{_CAUSES.get(values['cause'], _CAUSES['gaussian'])}. The most probable values are {times} times as "
+            "probable."
         )
     text += " Do not use the values with the lowest RMSE as material constants."
     if values["blocks"]:
@@ -220,8 +225,8 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     replay = ", combined with the corrected replay of its scene" if values["replay"] else ""
     return (
         f"The intervals are approximate: the engine {values['engine']!r} provides no derivatives, so an emulator was "
-        f"fitted to {values['calls']} of its calls{replay}. In cross-validation, the emulator's RMS error is "
-        f"{values['error_db']:.2g} dB at calls whose RMSE is below the median."
+        f"fitted to {values['calls']} engine calls{replay}. In cross-validation, the emulator's RMS error is "
+        f"{values['error_db']:.2g} dB for calls whose RMSE is below the median."
     )
 
 
@@ -233,19 +238,23 @@ def _conflict(values: dict[str, Any]) -> str:
         return (
             f"Measured {observables} changes from link to link by {values['slope']:.2f} times the change that the "
             f"calibrated model predicts (standard error {values['slope_error']:.2f}), "
-            f"{values['standard_errors']:.1f} standard errors below 1. Path loss or further observables alone require "
-            f"{answers}. Check the receiver's range, and that the values belong to these links and this scene."
+            f"{values['standard_errors']:.1f} standard errors below 1. Path loss alone, or further observables alone, "
+            f"would require {answers}. Check the receiver's range, and that the values belong to these links and this "
+            "scene."
         )
     return (
         f"Path loss and {observables} require parameter values that differ by {values['standard_errors']:.1f} standard "
-        f"errors: {answers}. Check units, the receiver's range and the scene; the common fit explains neither of them."
+        f"errors: {answers}. The joint fit explains neither quantity. Check units, the receiver's range and the scene."
     )
 
 
 def _unreached_links(values: dict[str, Any]) -> str:
     trials, sample = zip(values["switches"], values["reached"], strict=True), values["sample"]
-    reached = ", ".join(f"{count:.0f} have a path with {switch}" for switch, count in trials)
-    text = f"{values['links']:,} of {values['of']:,} links have no path, so no material is fitted to them."
+    reached = ", ".join(f"{count:.0f} {_have(count)} a path with {switch}" for switch, count in trials)
+    text = (
+        f"{values['links']:,} of {values['of']:,} links {_have(values['links'])} no path. Links without a path do not "
+        "constrain any material."
+    )
     if max(values["reached"], default=0.0) == 0:
         return (
             f"{text} No tested setting of [trace] finds a path for any of {sample} sampled links: check the "
@@ -281,8 +290,8 @@ def _ray_mapping(values: dict[str, Any]) -> str:
     # Records of earlier versions lack this value.
     if not values.get("meets_calibrated", True):
         return (
-            f"No path of the program interacts with a calibrated material, so its {values['calls']} calls do not show "
-            "whether the model represents the program. Calibrate materials on the paths, or check the paths."
+            f"No path of the program interacts with a calibrated material, so the program's {values['calls']} calls do "
+            "not show whether the model represents the program. Calibrate materials on the paths, or check the paths."
         )
     assumed = zip(values["names"], values["values"], strict=True)
     constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
@@ -291,7 +300,7 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         surfaces = f"slabs, except half-spaces of {' and '.join(values['half_spaces'])},"
     text = (
         f"The model explains the ratios of the ray powers in {values['calls']} calls with a misfit of "
-        f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call within {values['gap_db']:.3f} dB"
+        f"{values['misfit_db']:.3f} dB, and predicted path loss at the last call to within {values['gap_db']:.3f} dB"
     )
     if values["understood"]:
         text = f"The model represents the program. {text}. Its surfaces are {surfaces}"
@@ -306,13 +315,14 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         )
     if values["changed"]:
         text += (
-            f" Up to {values['changed']} paths of one call are absent from another; without them, the path loss of a "
-            f"link changes by up to {values['changed_db']:.2f} dB"
+            f" Up to {values['changed']} paths of one call are absent from another; without these paths, the path loss "
+            f"of a link changes by up to {values['changed_db']:.2f} dB"
         )
-        text += f", and {values['lost']} links have no path." if values.get("lost") else "."
-    if lost := values.get("lost_rows"):
-        text += f" {counted(len(lost), 'link')} {'has' if len(lost) == 1 else 'have'} no path in some of the calls "
-        text += f"({rows_text(lost)})."
+        lost = values.get("lost")
+        text += f", and {counted(lost, 'link')} {_have(lost)} no path." if lost else "."
+    if rows := values.get("lost_rows"):
+        text += f" {counted(len(rows), 'link')} {_have(len(rows))} no path in some of the calls "
+        text += f"({rows_text(rows)})."
         if values["excluded"]:
             text += (
                 ' Such a call cannot be the best one: set objective.no_path = "censor" and objective.ceiling_db, or '
@@ -323,10 +333,10 @@ def _ray_mapping(values: dict[str, Any]) -> str:
 
 def _missing_region(values: dict[str, Any]) -> str:
     return (
-        f"Losses of {values['attenuation']:.2g} dB/m within x = {values['west']:.0f} to {values['east']:.0f} m, "
-        f"y = {values['south']:.0f} to {values['north']:.0f} m, up to z = {values['height']:.0f} m, on the straight "
-        f"line of {values['links']} links, would explain {percent(values['share'])} of the mean square of the "
-        f"residuals (by chance alone: {percent(values['chance'])}). The materials may compensate for part of these "
+        f"Losses of {values['attenuation']:.2g} dB/m within x = {values['west']:.0f} to {values['east']:.0f} m, y = "
+        f"{values['south']:.0f} to {values['north']:.0f} m, up to z = {values['height']:.0f} m, on the straight line "
+        f"between the ends of {values['links']} links, would explain {percent(values['share'])} of the mean square of "
+        f"the residuals (by chance alone: {percent(values['chance'])}). The materials may compensate for part of these "
         "losses, and the verdicts assume that nothing is missing there. Check whether there are trees, or furniture "
         "indoors, and state them under [regions]; a wrong antenna direction can have the same effect."
     )
@@ -344,7 +354,7 @@ def _differing_groups(values: dict[str, Any]) -> str:
     return (
         f"Residuals of neighbouring links depend on the column {values['column']!r} more than expected by chance. "
         f"Measured minus modelled path loss, compared with neighbouring links: {groups}{more}.{others} If the column "
-        f"contains devices, antennas, carriers or days, fit an offset for each: [offset] per = "
+        "contains devices, antennas, carriers or days, fit an offset for each: [offset] per = "
         f"{f'[{per}]' if len(values['per']) > 1 else per}."
     )
 
@@ -358,24 +368,20 @@ def _retraced(values: dict[str, Any]) -> str:
             f"(fidelity.tolerance_db), by up to {values['largest_db']:.2f} dB"
         )
     if lost:
-        changes.append(
-            f"{lost:,} of {total} {'has' if lost == 1 else 'have'} a path in only one of the traces"
-        )
+        changes.append(f"{lost:,} of {total} {_have(lost)} a path in only one of the traces")
     return (
         f"When the scene is traced again with the calibrated values, {', and '.join(changes)}. Values and intervals "
-        "depend on which paths were found: increase trace.samples, if it is a number, or fidelity.rounds."
+        "depend on which paths were found. Increase fidelity.rounds or, if trace.samples is a number, trace.samples."
     )
 
 
 def _worse_than_mean(values: dict[str, Any]) -> str:
-    order = (
-        "that the program answers in the order of the links" if values["program"] else "the rows of the table"
-    )
+    order = "the order of the program's answers" if values["program"] else "the rows of the table"
     return (
         f"The calibrated model fits the links worse than a constant: its RMSE is {values['found_db']:.2f} dB, that of "
         f"the mean measured path loss {values['mean_db']:.2f} dB, and that of the log-distance model "
-        f"{values['log_distance_db']:.2f} dB. Do not use the result. Check {order}, units, and the coordinate frame of "
-        "links and scene."
+        f"{values['log_distance_db']:.2f} dB. Do not use the result. Check {order}, the units, and the coordinate "
+        "frame of links and scene."
     )
 
 
@@ -406,15 +412,15 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     ),
     RemarkKind.WORSE_THAN_START: lambda values: (
         f"The method did not improve on the initial values: they have an RMSE of {values['start_db']:.2f} dB, and the "
-        f"best candidate of the method has {values['found_db']:.2f} dB. "
-        + ("The result has the initial values. " if values.get("kept") else "Do not use the result. ")
+        f"method's best candidate has {values['found_db']:.2f} dB. "
+        + ("The result keeps the initial values. " if values.get("kept") else "Do not use the result. ")
         + _larger_budget(values)
     ),
     RemarkKind.WORSE_THAN_MEAN: _worse_than_mean,
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
         "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing, so "
-        "no parameter is more than weakly identified. Calibrate fewer parameters, or give them priors."
+        "parameters are at best weakly identified. Calibrate fewer parameters, or give them priors."
     ),
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
     RemarkKind.RAY_MAPPING: _ray_mapping,
@@ -422,12 +428,12 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.RETRACED: _retraced,
     RemarkKind.LOST_PATHS: lambda values: (
         f"{values['calls']} of {values['of']} RT calls cannot be the result, because links that had a path at the "
-        f'initial values have none there ({rows_text(values["rows"])}). Set objective.no_path = "censor" and '
-        "objective.ceiling_db, or leave these links out."
+        f'initial values have no path in these calls ({rows_text(values["rows"])}). Set objective.no_path = "censor" '
+        "and objective.ceiling_db, or leave these links out."
     ),
     RemarkKind.GIVEN_ENGINE: lambda values: (
         f"Path loss was computed by the engine {values['engine']}, which was passed to calibrate. Predictions, maps "
-        f"and suggestions use the study's engine {values['used']!r}; they are correct only if both engines agree."
+        f"and suggestions use the study's engine {values['used']!r}; these are correct only if both engines agree."
     ),
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.MISSING_REGION: _missing_region,
@@ -443,11 +449,11 @@ _BASELINES: Final[dict[str, str]] = {
     Model.LOG_DISTANCE: "a log-distance model",
     Model.OBSTRUCTION: "a log-distance model with obstruction",
 }
-"""Names of baselines within a sentence, if they differ from the names of the models."""
+"""Names of baselines for use within a sentence, if these names differ from those of the models."""
 
 
 def judgement_text(judgement: Judgement) -> str:
-    """Improvement of calibration over the best baseline on held-out links, with its certainty."""
+    """State by how much calibration improves on the best baseline on held-out links, and how certain this is."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')}"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
@@ -461,7 +467,7 @@ def judgement_text(judgement: Judgement) -> str:
 
 
 def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
-    """The model chosen on held-out blocks, and the reason for the choice.
+    """State which model was chosen on held-out blocks, and the reason for the choice.
 
     `best` has the lowest RMSE on these blocks among the models that can predict any link. `partner` is the model with
     which the chosen model is averaged.
@@ -484,15 +490,15 @@ def choice_text(chosen: str, best: str, partner: str | None = None) -> str:
 
 
 def unused_choice_text(chosen: str) -> str:
-    """A note that a validation after the run has chosen a model that predictions do not use."""
+    """A note that a validation after the run chose a model that predictions do not use."""
     return (
-        f"On the blocks, the model {str(chosen)!r} is chosen, but predictions do not use it yet. To use it, run the "
-        "study again with [holdout] blocks."
+        f"On held-out blocks, the model {str(chosen)!r} is chosen, but predictions do not use this model yet. To use "
+        "it, run the study again with [holdout] blocks."
     )
 
 
 def chosen_model_text(record: Record) -> str:
-    """The held-out accuracy of the prediction model; empty if this is the calibrated model."""
+    """State the held-out accuracy of the prediction model; empty if the prediction model is the calibrated model."""
     model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
     if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""
@@ -503,14 +509,14 @@ def chosen_model_text(record: Record) -> str:
 
 
 def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
-    """All remarks about a result: warnings, advice, the judgement on held-out links and the choice of the model.
+    """All remarks about a result: warnings, advice, the judgement on held-out links, and the choice of the model.
 
     `choice` is the reason for the prediction model, if validation chose it.
     """
     sentences = [
         remark_text(remark)
         for remark in record.uncertainty.remarks
-        # A finished result may have been validated later.
+        # A finished result may be validated later.
         if remark.kind != RemarkKind.NOT_JUDGED or record.held_out is None
     ]
     if record.accuracy.judgement is not None:
