@@ -130,7 +130,9 @@ def test_the_reported_path_loss_is_that_of_paths_sampled_with_the_calibrated_mat
 def test_a_scene_that_changed_since_the_calibration_is_not_exported_or_shown(folder, tmp_path):
     result = Result.load(folder / "out")
     other = changed(result, files={name: "0" * 64 for name in result.provenance.files})
-    with pytest.raises(InputError, match=r"changed since the calibration, so the export would not be"):
+    with pytest.raises(
+        InputError, match=r"changed since the calibration, so the exported scene would not be"
+    ):
         export(other, tmp_path / "exported")
     assert not (tmp_path / "exported").exists()
     assert export(other, tmp_path / "exported", allow_changed_inputs=True) == FILES

@@ -99,7 +99,7 @@ def test_an_average_without_nuisances_is_a_whole_sentence():
     near = {name: 1.01 * value for name, value in values.items()}
     model = {"averaged": values, "parameters": near}
     average = predicted_by(Model.AVERAGE_CALIBRATED, **model)
-    text = "with materials calibrated with a prior, averaged with the calibrated ones"
+    text = "with materials calibrated with a prior, averaged with the calibrated materials"
     assert prediction_text(average).startswith(
         f"Predictions and maps use the model '{Model.AVERAGE_CALIBRATED}', {text}, and the fitted offset."
     )

@@ -383,7 +383,10 @@ def test_the_summary_says_which_parameters_are_identified(result):
     )
     assert "or the best fit is outside the interval" in answer(one_range, "How certain are the values?")
     material = unidentified.rpartition(".")[0]
-    for count, words in ((0, "no path of any link interacts with it"), (1, "1 of 12 links has paths that")):
+    for count, words in (
+        (0, "no path of any link interacts with this material"),
+        (1, "1 of 12 links has paths that"),
+    ):
         sentences = summary(known, {material: count})
         assert any(part.text.startswith(material) and words in part.text for part in sentences)
     # No path interacts with an antenna or a region.

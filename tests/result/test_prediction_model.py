@@ -183,7 +183,7 @@ def test_initial_materials_that_blocks_choose_are_averaged_with_the_model_with_a
     result.save(tmp_path / "out")
     assert Result.load(tmp_path / "out").predict(links) == pytest.approx(result.predict(links), abs=1e-9)
     assert (
-        "materials calibrated with a prior, averaged with the initial ones (weight 1/3), and the fitted constant"
+        "materials calibrated with a prior, averaged with the initial materials (weight 1/3), and the fitted constant"
         in prediction_text(result)
     )
     assert "average" in scene_alone_text(result)

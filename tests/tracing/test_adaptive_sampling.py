@@ -78,7 +78,7 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
     text = report.last_round(rounds.settings, 0.5)
     assert text.startswith("Converged: 1,000,000 rays per position") or rounds.settings["rays"] > 1_000_000
     assert report.last_round({"rays": 8, "last_round_db": 0.7}, 0.5) == (
-        "Not converged: 8 rays per position; the second half of them changed a link by 0.70 dB "
+        "Not converged: 8 rays per position; the second half of these rays changed a link by 0.70 dB "
         "(fidelity.tolerance_db = 0.5); increase trace.samples, or reduce trace.max_depth."
     )
     with pytest.raises(InputError, match="its last round of rays is the check"):

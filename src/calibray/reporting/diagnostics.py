@@ -1,4 +1,4 @@
-"""Diagnostics of a finished calibration as tables: residuals, leverage, power, trade-offs, neighbours and changes."""
+"""Tables that diagnose a finished calibration: residuals, leverage, power, trade-offs, neighbours and changes."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from calibray.uncertainty.residual_correlation import variogram
 from calibray.validation.held_out_statistics import spatial_blocks
 
 CLASSES: Final = 6
-"""Largest number of distance classes; all classes contain about the same number of links."""
+"""Maximum number of distance classes; all classes contain about the same number of links."""
 
 MOST_UNKNOWNS: Final = 300
-"""Largest number of unknowns for which the correlations of all pairs are computed."""
+"""Maximum number of unknowns for which the correlations of all pairs are computed."""
 
 
 STREETS: Final = 12
-"""Largest number of groups of neighbouring receivers."""
+"""Maximum number of groups into which neighbouring receivers are divided."""
 
 
 def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     """Compute tables that describe the residuals and the uncertainty of a calibration.
 
     Returns:
-        Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
-        and standard deviation of the residuals [dB] on the calibration links. Residuals are predicted minus measured
-        values of the measured quantity. "obstruction" and "streets": the same values, by the length of the straight
-        line below roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra loss would
-        explain the largest part of the residuals. "leverage": leverage and residual of every calibration link. "power":
-        share of the links' power by material and type of interaction. "trade_offs": correlation of the draws of each
-        pair of unknowns. "neighbours": semivariance of the residuals by distance between links, computed from the
-        positions of both ends. "moved": value of every parameter before and after calibration, with the change and the
-        width of the 95 % interval as shares of its range.
+        Tables by name; a table that cannot be computed is omitted. "distance", "depth" and "group": number of links,
+        mean and standard deviation of the residuals [dB] on the calibration links. Residuals are predicted minus
+        measured values of the measured quantity. "obstruction" and "streets": the same values, by the length of the
+        straight line below roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra
+        loss would explain the largest part of the residuals. "leverage": leverage and residual of every calibration
+        link. "power": share of the links' power by material and type of interaction. "trade_offs": correlation of the
+        draws of each pair of unknowns. "neighbours": semivariance of the residuals by distance between links, computed
+        from the positions of both ends. "moved": value of every parameter before and after calibration, with the change
+        and the width of the 95 % interval as shares of its range.
     """
     tables = {
         "distance": _by_distance(result),
@@ -62,7 +62,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
 
 def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
-    """The links used in the calibration, and their residuals in the measured quantity [dB]."""
+    """The links used in the calibration, and the residuals of these links in the measured quantity [dB]."""
     residuals, links = residual(result.links, measured_quantity(result).sign), result.links
     used = links["has_path"].to_numpy(bool) | (result.study.objective.no_path == "censor")
     mask = used & np.isfinite(residuals) & ~links["held_out"].to_numpy(bool)
@@ -70,7 +70,7 @@ def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]
 
 
 def link_distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
-    """Length of the links [L], [m]; None without positions."""
+    """Length of the links [L], [m]; None if the positions are unknown."""
     ends = ends_of(links)
     return None if ends is None else np.linalg.norm(ends[:, 3:] - ends[:, :3], axis=1)
 
@@ -104,7 +104,7 @@ def _by(result: Record, column: str) -> pd.DataFrame:
 
 
 def _by_obstruction(result: Record) -> pd.DataFrame:
-    """Links in sight, and classes of links out of sight by the length of the straight line below roofs."""
+    """Links in sight, and links out of sight in classes by the length of the straight line below roofs."""
     links, residuals = calibration_links(result)
     if not {OUT_OF_SIGHT, "obstruction_m"} <= set(links.columns) or len(residuals) < FEW:
         return pd.DataFrame()
@@ -128,7 +128,7 @@ def _by_obstruction(result: Record) -> pd.DataFrame:
 
 
 def _by_street(result: Record) -> pd.DataFrame:
-    """Groups of neighbouring receivers, named by the position of their centre."""
+    """Groups of neighbouring receivers; each group is named by the position of its centre."""
     links, residuals = calibration_links(result)
     ends = ends_of(links)
     if ends is None or len(residuals) < 2 * FEW:
@@ -150,7 +150,7 @@ def _by_street(result: Record) -> pd.DataFrame:
 
 
 def _missing_region(result: Record) -> pd.DataFrame:
-    """The rectangle in the remark on the calibrated model; without a remark, the one found for the prediction model."""
+    """The rectangle in the remark on the calibrated model; without a remark, the rectangle for the prediction model."""
     for remark in result.uncertainty.remarks:
         if remark.kind == RemarkKind.MISSING_REGION:
             return pd.DataFrame([{**remark.values, "significant": True}])
@@ -159,7 +159,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
     if ends is None:
         return pd.DataFrame()
     known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
-    # Positive where the measured path loss exceeds the predicted one.
+    # Excess loss is positive where the measured path loss exceeds the prediction.
     excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
     region = _searched(np.column_stack([ends, excess_db, known]).tobytes())
     return pd.DataFrame() if region is None else pd.DataFrame([region.row()])
@@ -167,7 +167,7 @@ def _missing_region(result: Record) -> pd.DataFrame:
 
 @lru_cache(maxsize=4)
 def _searched(rows: bytes) -> MissingRegion | None:
-    """The missing region, cached for a second use; `rows` holds the ends, excess loss and obstruction of each link."""
+    """Find and cache the missing region; `rows` contains the ends, the excess loss and the obstruction of each link."""
     links = np.frombuffer(rows).reshape(-1, 8)
     return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 
@@ -200,7 +200,7 @@ def _power(result: Record) -> pd.DataFrame:
 
 
 def _trade_offs(result: Record) -> pd.DataFrame:
-    # The correlation with an unknown that is the same in all draws is undefined.
+    # If an unknown is the same in all draws, its correlation with other unknowns is undefined.
     names = [name for name, values in result.uncertainty.draws.items() if np.ptp(values) > 0]
     if not 2 <= len(names) <= MOST_UNKNOWNS:
         return pd.DataFrame()
@@ -213,7 +213,7 @@ def _trade_offs(result: Record) -> pd.DataFrame:
 
 
 def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
-    """Draws of an unknown; their logarithms if the parameter is searched on a logarithmic scale."""
+    """Draws of an unknown, or the logarithms of the draws if the parameter is searched on a logarithmic scale."""
     values = np.array(result.uncertainty.draws[name])
     section = result.study.parameters.get(name)
     return np.log(values) if section is not None and section.scale == "log" else values
@@ -224,7 +224,7 @@ def _neighbours(result: Record) -> pd.DataFrame:
     ends = ends_of(links)
     if ends is None or len(residuals) < FEW:
         return pd.DataFrame()
-    # Distance in six dimensions: links of two transmitters to the same receiver are not neighbours.
+    # Distances are computed in six dimensions, so links from two transmitters to the same receiver are not neighbours.
     distance, semivariance, pairs = variogram(residuals, ends)
     return pd.DataFrame({"distance_m": distance, "semivariance_db2": semivariance, "pairs": pairs})
 

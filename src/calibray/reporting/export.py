@@ -32,14 +32,14 @@ FILES: Final = (
     "scene.xml", "load_scene.py", "calibration.json", "links.csv", "materials.csv", "materials.json", "materials.m",
 )  # fmt: skip
 VERIFIED_LINKS: Final = 3
-"""Number of links for which the path loss of the exported scene is verified."""
+"""Number of links for which the export checks the path loss of the exported scene."""
 
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
-"""Settings that have different names in Sionna RT's path solver."""
+"""Settings whose names differ in Sionna RT's path solver."""
 
 MATLAB: Final = """function T = materials
 %MATERIALS Calibrated materials as a table, or as a structure in Octave.
-%   Constants apply at {frequency:.9g} Hz. Columns _lower and _upper are the ends of 95 % intervals, NaN if unknown.
+%   Constants apply at {frequency:.9g} Hz. Columns _lower and _upper: ends of 95 % intervals, or NaN.
 %   For MATLAB's ray tracing: propagationModel("raytracing", "BuildingsMaterial", "custom", ...
 %     "BuildingsMaterialPermittivity", T.relative_permittivity(1), "BuildingsMaterialConductivity", T.conductivity(1))
 {columns}
@@ -62,18 +62,19 @@ def export(
 
     Args:
         result: The calibration.
-        folder: Folder to write into; created if needed.
-        copy_meshes: Copy the meshes into the folder; otherwise, the scene refers to the original files.
-        overwrite: Also replace files that Calibray did not write.
-        allow_changed_inputs: Export even if a file of the scene or an antenna has changed since the calibration.
+        folder: Folder to write into; a missing folder is created.
+        copy_meshes: If True, copy the meshes into the folder; otherwise, the scene refers to the original files.
+        overwrite: If True, also replace files that Calibray did not write.
+        allow_changed_inputs: If True, export even if a file of the scene or an antenna has changed since the
+            calibration.
 
     Returns:
-        Names of the files in the folder. `wording.scene_alone_text` states the difference between the scene alone and
-        the predictions.
+        Names of the files that were written to the folder. `wording.scene_alone_text` states the difference between the
+        scene alone and the predictions.
 
     Raises:
         InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links can no
-            longer be read, the scene has changed, or Sionna RT loads a scene that differs from the calibrated one.
+            longer be read, the scene has changed, or the scene that Sionna RT loads differs from the calibrated scene.
     """
     study = result.study
     target = check_outputs(folder, FILES, study.files(), overwrite)
@@ -82,8 +83,8 @@ def export(
     )
     if not allow_changed_inputs and (changed := changed_files(result, input_digests(study, scene))):
         raise InputError(
-            f"{study.path}: {', '.join(changed[:5])} changed since the calibration, so the export would not be the "
-            "calibrated scene; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
+            f"{study.path}: {', '.join(changed[:5])} changed since the calibration, so the exported scene would not be "
+            "the calibrated scene; calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
         )
     links = survey(result)
     if links is None:
@@ -117,8 +118,8 @@ def export(
 
 
 def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
-    """Load the written scene as a user would, and compare it with the calibrated scene."""
-    # Sionna RT takes seconds to import.
+    """Load the written scene as a user would, and compare the loaded scene with the calibrated scene."""
+    # Importing Sionna RT takes seconds.
     from calibray.tracing.sionna import Tracer
     from calibray.tracing.sionna.live_scene import verify_export
 
@@ -129,7 +130,7 @@ def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
 
 
 def _links(result: Record) -> pd.DataFrame:
-    """The links, the nuisance that predictions add to the scene's path loss, and the reported path loss [dB]."""
+    """Tabulate the links, the nuisance that predictions add to the scene's path loss, and reported path loss [dB]."""
     scene_db, predicted_db = (result.links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
     if result.prediction.model.parameters is None:
         return result.links.assign(nuisance_db=0.0, reported_db=scene_db)
@@ -140,7 +141,7 @@ def _links(result: Record) -> pd.DataFrame:
 
 
 def matlab(materials: pd.DataFrame, frequency: float) -> str:
-    """Text of a MATLAB function that returns the materials as a table, or as a structure in Octave; carrier in [Hz]."""
+    """Text of a MATLAB function that returns the materials as a table or, in Octave, a structure; carrier in [Hz]."""
     columns = []
     for name in materials.columns:
         cells = materials[name].tolist()
@@ -153,7 +154,7 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
-    """One row per material: the constants that predictions use, and the interval and verdict of each calibrated one."""
+    """One row per material: the constants used in predictions, and interval and verdict for calibrated constants."""
     names = exported_names(result.scene_materials)
     for name, material in result.scene_materials.items():
         row: dict[str, Any] = {"material": name, "scene_name": names[name]}
@@ -164,7 +165,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
             if owner not in names:
                 continue  # the parameter belongs to an antenna or a region, not a material
             interval = result.intervals.get(parameter) if owner == name else None
-            # All rows have the columns of all calibrated constants.
+            # Every row has columns for all calibrated constants.
             row.setdefault(f"{constant}_lower", math.nan)
             row.setdefault(f"{constant}_upper", math.nan)
             row.setdefault(f"{constant}_verdict", "")
@@ -179,7 +180,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
 
 
 def _calibration(result: Record) -> dict[str, Any]:
-    """Data that the script requires in addition to the scene and the links."""
+    """The data that the script needs beyond the scene and the links."""
     study = result.study
     tx, rx = study.antenna_pair
     names = exported_names(result.scene_materials)
@@ -211,13 +212,13 @@ def _calibration(result: Record) -> dict[str, Any]:
 
 
 def _with_samples(settings: TraceSettings) -> dict[str, object]:
-    """The settings with a fixed number of rays, because Sionna RT's solver does not add rays in rounds."""
+    """The trace settings with a fixed number of rays, because Sionna RT's solver does not add rays in rounds."""
     record: dict[str, object] = dict(settings.record())
     return {**record, "samples": TraceSettings.samples} if settings.adaptive else record
 
 
 def _without_unknown(row: dict[str, Any]) -> dict[str, Any]:
-    """A row without its name and without unknown values, because JSON has no NaN."""
+    """A row without its name and without unknown values; unknown values are omitted because JSON has no NaN."""
     return {
         name: value
         for name, value in row.items()
@@ -230,6 +231,6 @@ def _json(content: dict[str, Any]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Text as a string literal of MATLAB and Octave, with unprintable characters escaped."""
+    """Convert text to a string literal for MATLAB and Octave, with unprintable characters escaped."""
     doubled = printable(text).replace("'", "''")
     return f"'{doubled}'"

@@ -1,4 +1,4 @@
-"""Figures of calibrations: cost and convergence as in the paper, path loss, and residuals."""
+"""Figures of calibrations: cost and convergence, as in the paper, path loss, and residuals."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from calibray.support import figure_style as style
 from calibray.support.messages import shortened
 
 SYMBOLS: Final = 60
-"""Largest number of links that are drawn as symbols joined by a line."""
+"""Maximum number of links that are drawn as symbols joined by a line."""
 
 FILE_ORDER: Final = 500
-"""Largest number of links that are drawn in the order of the study's file, with held-out links shaded. A larger number
-of links is sorted by measured path loss."""
+"""Maximum number of links that are drawn in the order of the study's file, with held-out links shaded. If there are
+more links, they are sorted by measured path loss."""
 
 RASTERIZED: Final = 2000
-"""Largest number of points that are drawn as vectors; a larger number is rasterized."""
+"""Maximum number of points that are drawn as vector graphics; if there are more, the points are rasterized."""
 
 LONG: Final = 1000
-"""Number of RT calls above which the axis is logarithmic, because the first calls reduce the RMSE the most."""
+"""Number of RT calls above which the axis is logarithmic, because the first calls reduce the RMSE most."""
 
 GROUPS: Final = 24
-"""Largest number of groups shown; these are the groups with the most links."""
+"""Maximum number of groups shown; the groups with the most links are shown."""
 
 
 @style.styled()
@@ -50,7 +50,8 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
             label = f"{method_text(result, method)}: {value.iloc[-1]:.4g}"
             axes.plot(value.index, value, "o-", ms=4, color=style.COLORS.get(method), label=label)
             if method == "sgwo-im":
-                # The first iterations evaluate all wolves, later ones only those that the surrogate selects.
+                # The first iterations evaluate all wolves; later iterations evaluate only the wolves that the surrogate
+                # selects.
                 calls = result.history.groupby("iteration").size()
                 for first in calls[calls < calls.iloc[0]].index[:1]:
                     axes.axvline(
@@ -64,7 +65,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Draw the best RMSE so far versus RT calls and, if known, the RMSE of the global optimum [dB]."""
+    """Draw the lowest RMSE so far versus RT calls and, if known, the RMSE of the global optimum [dB]."""
     figure, axes = style.plain_figure("RT calls", "Best RMSE so far [dB]")
     for method, result in results.items():
         history = result.history
@@ -88,7 +89,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     links = first.links
     few, many = len(links) <= SYMBOLS, len(links) > FILE_ORDER
     number = np.arange(1, len(links) + 1)
-    # Curves of many links are readable only if the links are sorted by measured path loss.
+    # With many links, curves are readable only if the links are sorted by measured path loss.
     order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else number - 1
     x_label = "Receiver" if few else "Link, by measured path loss" if many else "Link"
     quantity = measured_quantity(first)
@@ -111,7 +112,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     draw(first, "before", "s--", ".", color=style.FAINT, ms=4 if few else 2, lw=1, label="before calibration")
     for index, (method, result) in enumerate(results.items()):
         color, size = style.COLORS.get(method, style.BLUE), 2 if many else 4
-        # Lines on top are thinner, so that the lines below them remain visible.
+        # Upper lines are thinner, so that the lines below them remain visible.
         width = 1.3 + 1.4 * (len(results) - 1 - index)
         draw(result, "after", "-", ".", color=color, label=method_text(result, method), ms=size, lw=width)
     axes.set_xlim(0, len(links) + 1)
@@ -165,7 +166,7 @@ def residual_by_group(survey: Survey) -> Figure:
 
 
 def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
-    """All figures of a calibration by name; without `links`, the figures that require positions are omitted."""
+    """All figures of a calibration, by name; without `links`, figures that require positions are omitted."""
     method = {result.study.method.name: result}
     figures = {
         "convergence": convergence(method),
@@ -190,14 +191,14 @@ def _unequal(results: Mapping[str, Record]) -> bool:
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Start and end of every run of True in a mask."""
+    """Start and end of every run of True values in a mask."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return [(int(start), int(end)) for start, end in edges.reshape(-1, 2)]
 
 
 @style.styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured versus modelled values of the first observables, minus device biases; None without observables."""
+    """Draw measured versus modelled values of the first observables, without device biases; None if there are none."""
     fits = dict(list(result.fit.observables.items())[:PANELS])
     if not fits:
         return None

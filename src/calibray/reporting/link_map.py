@@ -1,4 +1,4 @@
-"""Maps of links over the outlines of buildings: in the report, coloured by residual, and as a separate file."""
+"""Maps of links on the outlines of buildings, either in the report, coloured by residual, or as a separate file."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from calibray.support.messages import counted
 from calibray.support.output_files import check_file, replacing
 
 WIDTH: Final = 1000
-"""Width of the map, and its largest height, in map units."""
+"""Width of the map, which is also its maximum height, in map units."""
 
 LEAST_ASPECT: Final = 0.45
-"""Smallest ratio of height to width; without it, the map of links along a street would be a thin strip."""
+"""Smallest ratio of height to width; without this limit, the map of links along a street would be a thin strip."""
 
 MARGIN: Final = 0.12
 """Margin around the links, as a share of their extent."""
@@ -36,14 +36,14 @@ LEAST_EXTENT: Final = 5.0
 """Smallest extent of the map [m]."""
 
 MOST_WALLS: Final = 20_000
-"""Largest number of lines that are drawn for vertical faces; the longest lines are drawn first."""
+"""Maximum number of lines drawn for vertical faces; if there are more, the longest lines are drawn."""
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
-"""Colours from negative to positive residuals; colour-blind readers can distinguish the two ends."""
+"""Colours from negative to positive residuals; colour-blind readers can distinguish the two ends of the scale."""
 
 
 OUTLINED: Final = 400
-"""Largest number of links whose symbols have an outline."""
+"""Maximum number of links for which symbols have an outline."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class Plan:
         north: Coordinate of the upper edge [m].
         scale: Map units per metre [1/m].
         buildings: Outlines of buildings, as SVG path data.
-        walls: Vertical faces seen from above, in the same form.
+        walls: Vertical faces seen from above, as SVG path data.
         bar: Length of the scale bar [m].
-        regions: Outlines of the study's regions, in the same form.
+        regions: Outlines of the study's regions, as SVG path data.
     """
 
     height: int
@@ -71,24 +71,24 @@ class Plan:
     regions: str = ""
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions [n, 2 or 3], [m], to map units measured from the upper left corner [n, 2]."""
+        """Convert positions [n, 2 or 3], [m], to coordinates from the upper left corner, in map units [n, 2]."""
         return np.stack(
             [(points[:, 0] - self.west) * self.scale, (self.north - points[:, 1]) * self.scale], axis=1
         )
 
 
 def plan(survey: Survey, triangles: Triangles | None, regions: Iterable[Region] = ()) -> Plan:
-    """Lay out the map of a calibration's links, over the scene if it can be read, and over regions such as trees."""
+    """Lay out the map of a calibration's links, with regions such as trees and, if it can be read, with the scene."""
     layout = lay_out(np.concatenate([survey.tx, survey.rx]), triangles)
     return replace(layout, regions="".join(_outlines(region, layout) for region in regions))
 
 
 def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
-    """Lay out a map that shows positions [n, 2 or 3], [m], over the scene if it can be read."""
+    """Lay out a map of positions [n, 2 or 3], [m], with the scene if it can be read."""
     ends = ends[:, :2]
     low, high = ends.min(axis=0), ends.max(axis=0)
     extent = np.maximum((high - low) * (1 + 2 * MARGIN), LEAST_EXTENT)
-    # The height is LEAST_ASPECT to 1 times the width.
+    # The ratio of height to width lies between LEAST_ASPECT and 1.
     extent[1] = max(extent[1], LEAST_ASPECT * extent[0])
     extent[0] = max(extent[0], extent[1])
     middle = (low + high) / 2
@@ -103,7 +103,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
 
 
 def marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """The symbols of links on the map: discs at the end that has more positions, and triangles at the other end."""
+    """The symbols of links on the map: discs at the end with more positions, and triangles at the other end."""
     residuals = links.residual_db
     limit = ramp_limit(residuals)
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
@@ -111,7 +111,7 @@ def marks(links: Survey, layout: Plan) -> dict[str, Any]:
     count = len(residuals)
     position = layout.project(moving).round(1).tolist()
     color, held_out, lost = ramp(residuals, limit), links.table["held_out"].to_numpy(bool), ~links.has_path
-    # The largest residuals are drawn last, on top.
+    # The largest residuals are drawn last, so that they lie on top.
     order = np.argsort(np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")
     return {
         "width": WIDTH,
@@ -143,7 +143,7 @@ def ramp(value: NDArray[np.float64], limit: float) -> list[str]:
 
 
 def ramp_limit(value: NDArray[np.float64]) -> float:
-    """The end of the ramp: a round number that 95 % of the absolute values [n] do not exceed; NaN is ignored.
+    """The end of the colour ramp: a round number that 95 % of the absolute values [n] do not exceed; NaN is ignored.
 
     Example:
         >>> ramp_limit(np.linspace(-4.3, 4.3, 50))
@@ -158,7 +158,7 @@ def _round(value: float, up: bool = False) -> float:
     """The largest number of the series 1, 2, 5, 10, ... not above a value or, with `up`, the smallest not below it."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
-    # A rounding error above a step must not lead to the next one.
+    # A rounding error above a step must not lead to the next step.
     return float(steps[steps >= value * 0.999].min() if up else steps[steps <= value * 1.001].max())
 
 
@@ -182,7 +182,7 @@ def _outlines(region: Region, layout: Plan) -> str:
 
 
 def _walls(triangles: Triangles, layout: Plan) -> str:
-    """The vertical faces within the map, each as the line between its ends in plan; identical lines are drawn once."""
+    """Vertical faces within the map; in plan, each is the line between its ends, and identical lines are drawn once."""
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)
     steep = (np.abs(normal[:, 2]) < STEEP * area) & (area > 0)
@@ -221,7 +221,7 @@ def save_positions(
         tx: Transmitters [n, 3], [m]; repeated positions are drawn once.
         rx: Receivers [m, 3], [m].
         inputs: Files that are never replaced.
-        overwrite: Also replace a file that Calibray did not write.
+        overwrite: If True, also replace a file that Calibray did not write.
 
     Raises:
         InputError: The file has an unknown suffix or must not be replaced, or the scene cannot be read.
@@ -251,7 +251,8 @@ def draw_positions(source: str | Path, tx: ArrayLike, rx: ArrayLike) -> Figure:
         if not is_ground(mesh, extent):
             corners = mesh.vertices[mesh.faces]
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            # Walls are lines in plan and get an edge; edges between the triangles of a roof are not drawn.
+            # In plan, walls are lines, so they are drawn with an edge; edges between the triangles of a roof are not
+            # drawn.
             steep = np.abs(normal[:, 2]) <= LEVEL * np.linalg.norm(normal, axis=1)
             edges = np.where(steep, FAINT, LINE).tolist()
             axes.add_collection(

@@ -22,7 +22,7 @@ class Survey:
         tx: Transmitters [L, 3], [m].
         rx: Receivers [L, 3], [m].
         group: Names of the groups [L]; None without groups.
-        sign: 1 if path loss was measured, -1 if power or gain was measured.
+        sign: 1 if path loss was measured; -1 if power or gain was measured.
     """
 
     table: pd.DataFrame
@@ -38,12 +38,12 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured value, in the measured quantity [L], [dB]; NaN as described in `residual`."""
+        """Predicted minus measured value, in the measured quantity [L], [dB]; NaN in the cases listed in `residual`."""
         return residual(self.table, self.sign)
 
     @property
     def faint(self) -> NDArray[np.bool_]:
-        """Whether a link is near or below the noise floor and therefore left out of the calibration [L]."""
+        """Whether a link is near or below the noise floor and was therefore left out of the calibration [L]."""
         return _faint(self.table)
 
     @property
@@ -75,7 +75,7 @@ QUANTITIES: Final = {
 
 
 def measured_quantity(result: Record) -> Quantity:
-    """The quantity that was measured; path loss if the links have no other values."""
+    """The quantity that was measured; path loss if the links have no values of another quantity."""
     quantity = result.study.links.quantity
     return QUANTITIES[quantity if _column(result) in result.links else "path_loss"]
 
@@ -102,9 +102,10 @@ def _column(result: Record) -> str:
 def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
     """Predicted minus measured value of a result's links, in the measured quantity [L], [dB].
 
-    The sign is 1 if the quantity increases with path loss, otherwise -1. The prediction for a link without a path is
-    that of the fallback. The residual is NaN without a prediction, and for links near or below the noise floor. Links
-    received near the floor have favourable errors; for the others, only a lower bound of path loss is known.
+    `sign` is 1 if the measured quantity increases with path loss, otherwise -1. For a link without a path,
+    the fallback model provides the prediction. The residual is NaN if there is no prediction, and for links near or
+    below the noise floor. Links just above the floor are a biased sample, because only favourable errors keep them
+    there. Below the floor, only a lower bound on path loss is known.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return sign * np.where(np.isfinite(difference) & ~_faint(table), difference, np.nan)
@@ -115,9 +116,9 @@ def _faint(table: pd.DataFrame) -> NDArray[np.bool_]:
 
 
 def survey(result: Record) -> Survey | None:
-    """A calibration's links with their positions, from the result if it contains them, otherwise from the measurements.
+    """A calibration's links with positions; positions that the result lacks are read from the measurements.
 
-    None if the measurements cannot be read or have changed.
+    The result is None if the measurements cannot be read or have changed.
     """
     table, sign = result.links, measured_quantity(result).sign
     if (ends := result.ends) is not None:

@@ -1,7 +1,7 @@
 """The report of a calibration: a single HTML file that opens from disk and loads no other files.
 
-Names come from files and are not trusted. The template engine escapes text; `<`, `>` and `&` are escaped in embedded
-JSON; and a content security policy allows only the script with the stated checksum.
+Names come from files, so they are not trusted. The template engine escapes text, and `<`, `>` and `&` are escaped in
+embedded JSON. A content security policy allows only the script with the stated checksum.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from calibray.validation.validation import Validation, observables_table
 FILE: Final = "report.html"
 FIGURES: Final = "figures"
 WORST: Final = 10
-"""Largest number of links in the table of the largest residuals."""
+"""Maximum number of links in the table of the largest residuals."""
 
 CAPTIONS: Final = {
     "convergence": "RMSE of the best candidate so far versus RT calls (runs of the ray tracer over all links). The "
@@ -67,12 +67,12 @@ CAPTIONS: Final = {
     "leverage": "Residual versus leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
     "residual contains no information about its error.",
     "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
-    "Number of links in brackets.",
+    "The number of links is given in brackets.",
     "observables": "Measured versus modelled values of further observables, link by link, without device biases. "
     "The line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
-    "outside the black circle received more power than predicted. Orange: the stated pattern on the horizon, from its "
-    "maximum at the rim to 30 dB below the maximum at the centre.",
+    "outside the black circle received more power than predicted. Orange: the stated antenna pattern on the horizon, "
+    "from its maximum at the rim to 30 dB below this maximum at the centre.",
     "residual-by-group": "Residual by group: median, quartiles, and whiskers that contain 90 % of the links.",
 }
 
@@ -81,13 +81,13 @@ PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("
 
 @dataclass(frozen=True)
 class PageData:
-    """The data shown on a page in addition to the result.
+    """The data that a page shows beyond the result itself.
 
     Attributes:
-        links: The links with positions; None if these are unknown.
-        scene: The scene; None if it can no longer be read.
+        links: The links with their positions; None if the positions are unknown.
+        scene: The scene; None if the scene can no longer be read.
         triangles: Meshes of the scene.
-        rays: Paths of the links; None if these are not available.
+        rays: Paths of the links; None if no paths are available.
         missing: Items that are not shown, with the reasons.
         regions: Regions of the study, by name.
     """
@@ -111,12 +111,12 @@ def report(
     """Write the report of a calibration as one HTML file that opens from disk.
 
     Args:
-        result: The calibration; paths that it does not contain are read from the cache or traced.
-        file: File to write; an existing file is replaced only when the new file is complete.
-        figures: Folder for the figures as SVG and PNG, created if needed; figures of an earlier report are removed. If
-            None, no separate figures are written.
-        overwrite: Also replace files that Calibray did not write.
-        progress: Called with the stage "tracing" after every launch.
+        result: The calibration; paths that the calibration does not contain are read from the cache or traced.
+        file: File to write; an existing file is replaced only after the new file is complete.
+        figures: Folder for the figures as SVG and PNG; a missing folder is created, and figures of an earlier report
+            are removed. If None, no separate figure files are written.
+        overwrite: If True, also replace files that Calibray did not write.
+        progress: Function that is called with the stage "tracing" after every launch of rays.
 
     Raises:
         InputError: The file's name does not end in .html or .htm, the file or the folder cannot be written, or a file
@@ -136,11 +136,11 @@ def report(
         write_text(target, page(result, data, drawn))
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            # Drawn again, because figures within the page have no background.
+            # The figures are drawn again, because figures within the page have no background.
             for name, figure in result_figures(result, data.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
-            # Remove figures that an earlier result had and this one lacks.
+            # Remove figures that belong to an earlier result and that this result does not have.
             for picture in PICTURES:
                 if Path(picture).stem not in drawn:
                     (folder / picture).unlink(missing_ok=True)
@@ -150,7 +150,7 @@ def report(
 
 
 def collect(result: Record, progress: Progress | None = None) -> PageData:
-    """Collect the data of a page in addition to the result, and list the items that are not available."""
+    """Collect the data that a page needs beyond the result itself, and list the items that are not available."""
     study, missing = result.study, []
     links = survey(result)
     if links is not None and links.group is not None:
@@ -172,7 +172,9 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
         missing.append(f"Regions: {error}.")
     drawn = None
     if study.engine.external and result.paths is None:
-        reason = "are not in the ledger" if study.engine.exports_rays else "are not part of its answers"
+        reason = (
+            "are not in the ledger" if study.engine.exports_rays else "are not part of the program's answers"
+        )
         missing.append(f"Paths: the paths of the engine {study.engine.name} {reason}.")
     else:
         try:
@@ -239,7 +241,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
 
 
 def _title(study: Path) -> str:
-    """Name of a study: the name of its folder if the file is called study.toml, otherwise the name of the file."""
+    """Name of a study: the folder name if the file is called study.toml, otherwise the file name."""
     return (study.resolve().parent.name if study.stem == "study" else "") or study.stem
 
 
@@ -254,7 +256,7 @@ def _asset(name: str) -> str:
 
 
 def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
-    """The key figures at the top of the page: name, value, and lines with comparisons."""
+    """The key figures at the top of the page, each with a name, a value, and lines that compare it to other models."""
     model, fit = result.prediction.model, result.fit
     judged = result.holdout_rmse_db is not None
     errors = (
@@ -286,15 +288,15 @@ def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
 
 
 def _held_out_errors(result: Record) -> tuple[float | None, float | None, float | None]:
-    """Held-out RMSE of the prediction model, of the initial materials with nuisances, and of the log-distance model."""
+    """Held-out RMSE for the prediction model, the initial materials with nuisances, and the log-distance model."""
     model, accuracy = result.prediction.model, result.accuracy
-    # If held-out links chose the model, its residual is its RMSE on these links.
+    # If the model was chosen on held-out links, `residual_db` is its RMSE on these links.
     own_db = accuracy.holdout_rmse_db if model.name == Model.CALIBRATED else model.residual_db
     return own_db, accuracy.nuisance_only_holdout_rmse_db, accuracy.log_distance_holdout_rmse_db
 
 
 def _laws(result: Record) -> Table:
-    """The coefficients of the power laws of ITU-R P.2040, if they were calibrated."""
+    """The coefficients of the power laws of ITU-R P.2040, if any were calibrated."""
     names = ("itu_a", "itu_b", "itu_c", "itu_d")
     rows = tuple(
         (material, *(f"{law[name]:.4g}" if name in law else "-" for name in names))
@@ -307,7 +309,7 @@ def _laws(result: Record) -> Table:
 
 
 def _worst(result: Record, links: Survey | None) -> Table:
-    """The links with the largest residuals."""
+    """Tabulate the links with the largest residuals."""
     grouped, quantity = links is not None and links.group is not None, measured_quantity(result)
     columns = (
         numbers("Row"),
@@ -331,7 +333,7 @@ def _worst(result: Record, links: Survey | None) -> Table:
 
 
 def _held_out(result: Record) -> list[str]:
-    """How each link was held out: "yes" (always), "in turn" or "no"."""
+    """Whether each link was held out: "yes" (always), "in turn" or "no"."""
     blocks = np.zeros(len(result.links), bool) if result.held_out is None else result.held_out.block >= 0
     always = result.links["held_out"].to_numpy(bool)
     return np.select([always, blocks], ["yes", "in turn"], "no").tolist()
@@ -364,11 +366,11 @@ def _versions() -> Table:
 
 
 def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[str, Any] | None:
-    """Data for the page's script; None without positions of the links."""
+    """Data for the page's script; None if the positions of the links are unknown."""
     links = data.links
     if links is None or layout is None:
         return None
-    # Links store the index of their group, which takes less space than its name.
+    # Each link stores the index of its group, which takes less space than the name.
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
     materials = [] if data.scene is None else list(data.scene.materials)
@@ -396,5 +398,5 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
 
 
 def _rounded(values: np.ndarray) -> list[float | None]:
-    """Values rounded to 0.01 dB; None for infinity and NaN, which JSON cannot express."""
+    """Round values to 0.01 dB; None replaces infinity and NaN, which JSON cannot express."""
     return [round(value, 2) if math.isfinite(value) else None for value in values.tolist()]

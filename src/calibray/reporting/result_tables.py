@@ -1,4 +1,4 @@
-"""Tables of a calibration, and its calibrated values for the report."""
+"""Tables that describe a calibration, and the calibrated values as shown in the report."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MARKS: Final[dict[str, str]] = {
 
 
 def heading(result: Record) -> str:
-    """Study, method, engine and seed of a calibration."""
+    """State the study, method, engine and seed of a calibration."""
     study = result.study
     return (
         f"{study.path.name}: method {study.method.name}, engine {study.engine.name}, seed {study.method.seed}"
@@ -37,7 +37,7 @@ def heading(result: Record) -> str:
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:
-    """Short form for Python and notebooks: heading, and tables of parameters, nuisances and accuracy."""
+    """Short form for Python and notebooks: a heading, and tables of parameters, nuisances and accuracy."""
     parts = (parameters(result), nuisances(result), accuracy(result), observables(result))
     parts = (*parts, observables_table(result.accuracy.observables))
     return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
@@ -53,7 +53,7 @@ def tables(result: Record) -> tuple[Table, ...]:
 
 
 def links(result: Record) -> Table:
-    """Numbers of links, and the rows to check."""
+    """Numbers of links, and the rows that should be checked."""
     count = result.counts
     censored = result.study.objective.no_path == "censor"
     treatment = (
@@ -71,7 +71,7 @@ def links(result: Record) -> Table:
 
 
 def _held_out(result: Record) -> tuple[str, str]:
-    """Number of held-out links, and of blocks if they were held out in turn."""
+    """Number of held-out links and, if blocks were held out in turn, number of blocks."""
     if result.held_out is None:
         return str(result.counts["held_out"]), ""
     return str((result.held_out.block >= 0).sum()), f"in turn, in {len(result.held_out.labels)} blocks"
@@ -80,9 +80,9 @@ def _held_out(result: Record) -> tuple[str, str]:
 def suspicious_rows(
     without_path: Sequence[int], treatment: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Lines about links to check: label, number, and rows with a remedy.
+    """Lines about links to check; each line contains a label, the number of links, and their rows with a remedy.
 
-    `treatment` is appended to the rows without a path. If `enclosed` is None, antennas were not checked.
+    `treatment` is appended to the list of rows without a path. If `enclosed` is None, the antennas were not checked.
     """
     text = rows_text(without_path)
     yield "without a path", str(len(without_path)), text + treatment if text else ""
@@ -125,7 +125,7 @@ def reasons(result: Record) -> Table:
 
 
 def observables(result: Record) -> Table:
-    """The fit of further observables, each in its unit; no rows if the study has none."""
+    """The fit of further observables, each in its own unit; no rows if the study has no further observables."""
     rows = []
     for name, fit in result.fit.observables.items():
         biases = ", ".join(
@@ -151,9 +151,9 @@ def remarks(result: Record) -> Table:
 
 
 def nuisances(result: Record) -> Table:
-    """Offsets and the coefficients of further nuisances, by group; no rows if the study declares no nuisance.
+    """Offsets, and coefficients of further nuisances, by group; no rows if the study declares no nuisance.
 
-    If the posterior draws contain them, a further column shows their standard deviations.
+    If the posterior draws contain these coefficients, a further column shows their standard deviations.
     """
     nuisance, others = result.nuisance, _nuisances_besides_offset(result)
 
@@ -174,7 +174,7 @@ def nuisances(result: Record) -> Table:
             (f"{name}, {group}" if group else name, f"{value:+.3g}", spread(name, group))
             for group, value in values.items()
         ]
-    # The column of an offset is 1; that of a further nuisance can be a length or a number of walls.
+    # The column of an offset is 1; the column of a further nuisance can be a length or a number of walls.
     title, unit = ("Nuisances", "dB per unit") if others else ("Offsets", "dB")
     columns = (Column(), numbers(unit=unit), numbers("standard deviation", unit))
     shown = columns if any(row[2] for row in rows) else columns[:2]
@@ -182,7 +182,7 @@ def nuisances(result: Record) -> Table:
 
 
 def accuracy(result: Record) -> Table:
-    """RMSE before and after calibration, and of the baselines."""
+    """RMSE before and after calibration, and RMSE of the baselines."""
     fit, held_out = result.fit, result.accuracy
     rows = (
         ("before", fit.initial_rmse_db, held_out.initial_holdout_rmse_db),
@@ -220,7 +220,7 @@ def costs(result: Record) -> Table:
 
 @dataclass(frozen=True)
 class Value:
-    """A parameter as shown in the report: text, and positions on a bar between its bounds.
+    """A parameter as shown in the report, with texts, and with positions on a bar between the parameter's bounds.
 
     Attributes:
         name: Name of the parameter.
@@ -231,11 +231,11 @@ class Value:
         verdict: The verdict on the parameter.
         bounds: Lower and upper bound.
         scale: "linear" or "log".
-        positions: Positions of the values "before" and "after" on the bar, 0 to 1.
-        pieces: Ends of every piece of the interval on the bar, 0 to 1.
+        positions: Positions of the values "before" and "after" on the bar, from 0 to 1.
+        pieces: Ends of every piece of the interval on the bar, from 0 to 1.
         reason: The reason for the verdict; empty if unknown.
-        approximate: Whether the interval comes from an emulator of the engine.
-        predicted: The value that predictions use; empty if it is the calibrated value, or if predictions use no scene.
+        approximate: Whether the interval was computed with an emulator of the engine.
+        predicted: The value that predictions use; empty if predictions use the calibrated value or use no scene.
     """
 
     name: str
@@ -300,7 +300,7 @@ def _unit(name: str) -> str:
 
 
 def _bar(lower: float, upper: float, scale: str) -> Callable[[float], float]:
-    """Position of a value between its bounds, 0 to 1."""
+    """Make a function that gives the position of a value between its bounds, from 0 to 1."""
 
     def position(value: float) -> float:
         value = min(max(value, lower), upper)

@@ -20,12 +20,12 @@ from calibray.tracing.protocol import EnclosedAntennas
 
 _HEIGHT_SOURCES: Final = {
     "levels": "height from the number of storeys",
-    "default": "no usable height given, default used",
+    "default": "no usable height given, so the default is used",
 }
 
 
 def contents(scene: MadeScene) -> Table:
-    """The contents of a new scene, and the assumptions that were made."""
+    """The contents of a new scene, and the assumptions made for it."""
     west, south, bottom, east, north, top = scene.bounds
     rows = [
         ("scene", str(scene.path)),
@@ -48,7 +48,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def findings(check: SceneCheck) -> list[Table]:
-    """The size of a scene with a verdict, and its defects, if any."""
+    """The size of a scene, a verdict on the scene, and its defects, if any."""
     west, south, bottom, east, north, top = check.bounds
     errors = sum(finding.severity == "error" for finding in check.findings)
     warnings = sum(finding.severity == "warning" for finding in check.findings)
@@ -76,7 +76,7 @@ def findings(check: SceneCheck) -> list[Table]:
 
 
 def objects(check: SceneCheck) -> Table:
-    """The objects of a scene, with their numbers of faces and defects."""
+    """The objects of a scene, each with its numbers of faces and defects."""
     columns = (
         Column("object"), Column("material"), numbers("faces"), numbers("open edges"), numbers("unwelded edges"),
         numbers("flipped faces"), numbers("empty faces"), numbers("repeated faces"),
@@ -92,7 +92,7 @@ def objects(check: SceneCheck) -> Table:
 
 
 def assumptions(draft: Draft) -> Table:
-    """The assumptions of a drafted study with their reasons."""
+    """The assumptions of a drafted study, each with its reason."""
     rows = tuple((entry.what, entry.value, entry.reason) for entry in draft.assumptions)
     return Table("Assumptions", (Column(), Column(), Column("reason")), rows)
 
@@ -105,7 +105,7 @@ def warning_lines(findings: Sequence[Finding]) -> str:
 
 
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
-    """Numbers of links, paths and interactions, and the links to check by their rows in the source file [L].
+    """Numbers of links, paths and interactions, and the links to check, given by their rows in the file [L].
 
     If `enclosed` is None, antennas were not checked.
     """
@@ -120,9 +120,9 @@ def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | 
 
 
 def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float) -> tuple[Table | str, ...]:
-    """Change of path loss in a trace with more samples: a summary, the links with the largest changes, and a verdict.
+    """Change in path loss when tracing with more samples: a summary, the links with the largest changes, and a verdict.
 
-    Links are named by their rows in the source file [L]; `tolerance_db` is the largest acceptable change [dB].
+    Links are identified by their rows in the source file [L]; `tolerance_db` is the largest acceptable change [dB].
     """
     most_changed = _most_changed(change, row)
     verdict = _verdict(change, len(row), tolerance_db)
@@ -132,13 +132,13 @@ def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float
 def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
     """The verdict on the last round of a trace that adds rays in rounds.
 
-    `settings` are the trace settings of the paths; `tolerance_db` is the largest acceptable change of a link's path
-    loss [dB].
+    `settings` contains the trace settings of the paths; `tolerance_db` is the largest acceptable change in a link's
+    path loss [dB].
     """
     rays, change = int(str(settings["rays"])), float(str(settings["last_round_db"]))
     if not rays:
         return "Converged: only direct paths were searched, which requires no rays."
-    text = f"{rays:,} rays per position; the second half of them changed"
+    text = f"{rays:,} rays per position; the second half of these rays changed"
     tolerance = f"(fidelity.tolerance_db = {tolerance_db:g})"
     if change <= tolerance_db:
         return f"Converged: {text} no link by more than {max(change, 0.01):.2f} dB {tolerance}."

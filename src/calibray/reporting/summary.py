@@ -1,4 +1,4 @@
-"""The summary of a report: questions about a calibration, and answers computed from its record."""
+"""The summary of a report: questions about a calibration, with answers computed from the record."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from calibray.validation.validation import Validation
 Kind = Literal["plain", "good", "caution"]
 
 RARE: Final = 0.05
-"""Share of links with paths that interact with a material; below it, the advice is to measure more such links."""
+"""If fewer than this share of the links have a path that interacts with a material, the advice is to measure more such
+links."""
 
 LISTED_VALUES: Final = 6
-"""Largest number of identified values that are listed."""
+"""Maximum number of identified values that are listed."""
 
 MEANINGS: Final = {
-    Verdict.WEAKLY_IDENTIFIED: "weakly identified: each interval covers much of its range",
+    Verdict.WEAKLY_IDENTIFIED: "weakly identified: the interval covers much of the range",
     Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links, or the best fit is outside the interval",
     Verdict.AT_BOUND: "at a bound: the best value may lie outside the bounds, or the model is incomplete",
     Verdict.NOT_IDENTIFIABLE: "not identifiable: all values within the interval fit the links about equally well",
@@ -46,7 +47,7 @@ class Sentence:
     Attributes:
         heading: The question that the sentence answers; empty if it continues the previous answer.
         text: The answer.
-        kind: The kind of answer: neutral, favourable, or a caution.
+        kind: The kind of answer: neutral, favourable, or a warning.
     """
 
     heading: str
@@ -55,9 +56,10 @@ class Sentence:
 
 
 def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
-    """Summarize a calibration in a few sentences: model for predictions, fit, benefit, certainty, advice and warnings.
+    """Summarize a calibration in a few sentences: prediction model, fit, benefit, certainty, advice and warnings.
 
-    `links_by_material` is the number of links with a path that interacts with each material; None without paths.
+    `links_by_material` is the number of links with a path that interacts with the material, by material; None if there
+    are no paths.
     """
     return (
         Sentence("What do predictions use?", f"{prediction_text(result)} {scene_alone_text(result)}".strip()),
@@ -89,7 +91,7 @@ def _fit(result: Record) -> Sentence:
     )
     if result.fit.nuisance_only_rmse_db is not None:
         text += (
-            f" With the initial materials and fitted offsets or other nuisances, it is "
+            " With the initial materials and fitted offsets or other nuisances, the RMSE is "
             f"{result.fit.nuisance_only_rmse_db:.2f} dB."
         )
     return Sentence("How well does it fit?", text)
@@ -102,7 +104,7 @@ def _held_out_accuracy(result: Record) -> Sentence:
         validation = Validation.of(result.held_out)
         judgement = validation.judgement
         best_db = validation.table["rmse_db"].min()
-        text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
+        text = f"{block_sentence(validation)} The best model is {validation.best!r}, with an RMSE of {best_db:.2f} dB."
         if validation.chosen != result.prediction.model.name:
             text += f" {unused_choice_text(validation.chosen)}"
     if judgement is None:
@@ -148,8 +150,8 @@ def _certainty(result: Record) -> Iterator[Sentence]:
             names = _list(cast("list[str]", remark.values["names"]))
             yield Sentence(
                 "",
-                f"Calibrated values outside their intervals: {names}. They have the lowest RMSE, but nearly all "
-                "probable values are inside the intervals. Do not use the calibrated values as material constants.",
+                f"Calibrated values outside their intervals: {names}. These values have the lowest RMSE, but nearly "
+                "all probable values are inside the intervals. Do not use the calibrated values as material constants.",
                 "caution",
             )
 
@@ -158,18 +160,18 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
     heading = "What should be measured next?"
     unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
     owners = dict.fromkeys(name.rpartition(".")[0] for name in unidentified)
-    # Paths do not interact with the owners of other parameters, such as antennas.
+    # Some parameters belong to antennas, for example, with which paths do not interact.
     materials = [name for name in owners if name in result.materials]
     sentences = []
-    # Suggestions need derivatives, which programs do not provide.
+    # Suggestions need derivatives, which external programs do not provide.
     ranked = result.uncertainty.draws and not result.study.engine.external
     if ranked and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
         sentences.append(
-            "calibray suggest DIR CANDIDATES ranks candidate positions by the expected effect of a measurement there "
-            "on the widths of the intervals."
+            "calibray suggest DIR CANDIDATES ranks candidate positions by how much a measurement there should narrow "
+            "the intervals."
         )
     if materials and links_by_material is None:
-        sentences.append(f"Links whose strongest paths interact with {_list(materials)}.")
+        sentences.append(f"Measure links whose strongest paths interact with {_list(materials)}.")
     elif links_by_material is not None:
         total = max(len(result.links), 1)
         sentences += [f"{name}: {_coverage(links_by_material.get(name, 0), total)}." for name in materials]
@@ -177,16 +179,19 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
 
 
 def _coverage(count: int, total: int) -> str:
-    """Advice about a material that is not identifiable, based on the links with paths that interact with it."""
+    """Advice about a material that is not identifiable, based on the number of links whose paths interact with it."""
     if count == 0:
-        return "no path of any link interacts with it, so the links cannot identify it; measure links with such paths"
+        return (
+            "no path of any link interacts with this material, so the links cannot identify it; measure links that "
+            "have such paths"
+        )
     verb = "has" if count == 1 else "have"
-    links = f"{count:,} of {counted(total, 'link')} {verb} paths that interact with it"
+    links = f"{count:,} of {counted(total, 'link')} {verb} paths that interact with this material"
     if count < RARE * total:
-        return f"only {links}; measure more links of this kind"
+        return f"only {links}; measure more such links"
     return (
-        f"{links}, but the errors are too large, these paths are too weak, or other unknowns compensate; measure where "
-        "a path of this kind is the strongest"
+        f"{links}, but the errors are too large, these paths are too weak, or other unknowns compensate; measure links "
+        "on which such a path is the strongest"
     )
 
 
@@ -213,7 +218,7 @@ def _cautions(result: Record) -> Iterator[Sentence]:
     if result.nuisance.groups_without_path:
         groups = named(group_text(result, group) for group in result.nuisance.groups_without_path)
         sentences.append(
-            f"No calibration link of {groups} has {usable_link_text(result)}, so its offset is unknown."
+            f"No calibration link of {groups} has {usable_link_text(result)}, so the offset is unknown."
         )
     yield from _headed("What calls for caution?", sentences, "caution")
 
@@ -237,7 +242,7 @@ def _number(value: float) -> str:
 
 
 def _list(names: Sequence[str]) -> str:
-    """Names separated by commas, with "and" before the last name; only the first eight if there are more."""
+    """Join names with commas, and with "and" before the last; of more than eight names, list only eight."""
     if len(names) > 8:
         return named(names, 8)
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

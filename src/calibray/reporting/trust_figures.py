@@ -1,4 +1,4 @@
-"""Figures that show how reliable a calibration is: posterior, validation and diagnostics."""
+"""Figures that show the reliability of a calibration: posterior, validation and diagnostics."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from calibray.tracing.antennas import AntennaPattern, Mounting, Pose, jones_vect
 from calibray.validation.validation import Validation
 
 PARAMETERS: Final = 12
-"""Largest number of parameters that are shown; the least certain parameters are shown first."""
+"""Maximum number of parameters shown; the least certain parameters come first."""
 
 BARS: Final = 36
 """Number of bars in the histogram between a parameter's bounds."""
 
 ROWS: Final = 14
-"""Largest number of rows in the power figure."""
+"""Maximum number of rows in the power figure."""
 
 PANELS: Final = 6
-"""Largest number of panels of a figure; each panel shows an observable, or one of the transmitters with the most
-links."""
+"""Maximum number of panels in a figure; each panel shows an observable or a transmitter, those with the most links
+first."""
 
 DEEPEST_DB: Final = -30.0
-"""Level of the pattern at the centre of a figure [dB]. The back lobe of sector antennas is at about this level."""
+"""Level of the pattern at the centre of a figure [dB]. The back lobe of a sector antenna is at about this level."""
 
 
 def trust_figures(result: Record) -> dict[str, Figure]:
-    """Draw the figures for which the calibration contains data."""
+    """Draw those figures for which the calibration contains data."""
     tables, figures = diagnostics(result), {}
     if all(len(result.uncertainty.draws.get(name, ())) > 1 for name in result.parameters):
         figures["possible-values"] = possible_values(result)
@@ -111,7 +111,7 @@ def held_out_errors(validation: Validation) -> Figure:
     for name, color in _colors(validation):
         error = np.sort(np.abs(validation.errors[name][judged]))
         share = np.arange(1, len(error) + 1) / len(error)
-        # Without this limit, a few gross errors would compress the rest of the curves.
+        # Without this limit, a few very large errors would compress the rest of the curves.
         reach = max(reach, float(np.quantile(error, 0.97)))
         wide = 2.2 if name == validation.best else 1.2
         axes.step(error, share, where="post", color=color, lw=wide, label=f"{name}: {_rmse(error):.2f} dB")
@@ -138,7 +138,7 @@ def held_out_blocks(validation: Validation) -> Figure:
 
 
 def _colors(validation: Validation) -> list[tuple[str, str]]:
-    """Models with their colours; calibrated models get the main colours of the page."""
+    """Assign colours to models; calibrated models have the main colours of the page."""
     calibrated = iter((style.BLUE, style.ORANGE, style.GREEN))
     others = iter((style.FAINT, *style.PALETTE, *style.PALETTE))
     return [
@@ -199,9 +199,9 @@ def by_depth(table: pd.DataFrame) -> Figure:
 
 
 def residuals_by_direction(result: Record) -> Figure | None:
-    """Draw the residuals of links versus direction from their transmitter, with its antenna pattern on the horizon.
+    """Draw residuals versus the direction from the transmitter to the link, with the antenna pattern on the horizon.
 
-    The result is None if the study does not state the mounting of transmitters, or if its links cannot be read or have
+    The result is None if the study does not state the mounting of transmitters, or if the links cannot be read or have
     changed.
     """
     study = result.study
@@ -214,7 +214,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
         return None
     if not has_links(result, links):
         return None
-    # Predicted minus measured path loss: outer points received more power than predicted.
+    # Values are predicted minus measured path loss, so points farther out received more power than predicted.
     residuals = residual(result.links, sign=1)
     shown = np.isfinite(residuals) & result.links["has_path"].to_numpy(bool)
     has_names = study.links.transmitter in links.table.frame
@@ -235,7 +235,7 @@ def _polar_figures(
     residuals: NDArray[np.float64],
     mounting: Mounting,
 ) -> Figure | None:
-    """One polar plot for each transmitter; `bearing` is clockwise from y [L], [rad]."""
+    """Draw one polar plot for each transmitter; `bearing` is measured clockwise from the y axis [L], [rad]."""
     if not names:
         return None
     columns = min(len(names), 3)
@@ -263,10 +263,10 @@ def _polar_figures(
 
 
 def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gain of one link's antenna on the horizon, relative to its maximum on the horizon [n], [dB]."""
+    """Gain of a link's antenna on the horizon, relative to the maximum gain on the horizon [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
-    # On the horizon; azimuths are measured anticlockwise from the east, bearings clockwise from the north.
+    # Azimuths on the horizon are measured anticlockwise from east, and bearings clockwise from north.
     angles = np.stack([np.full(len(bearing), np.pi / 2), np.pi / 2 - bearing], axis=1)
     jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), wave_basis(angles), pose)
     power = (np.abs(jones) ** 2).sum(axis=(1, 2))

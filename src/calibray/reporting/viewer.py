@@ -1,7 +1,7 @@
-"""Data of the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
+"""Data for the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
 
-Positions are rounded to a grid over the scene with 65,536 points in each direction, which are 3 cm apart in a scene of
-2 km.
+Positions are rounded to a grid over the scene with 65,536 points in each direction; in a scene of 2 km, the grid points
+are 3 cm apart.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from calibray.study import Setup
 from calibray.support.progress import Progress
 
 PER_LINK: Final = 12
-"""Largest number of paths per link that are shown."""
+"""Maximum number of paths shown per link."""
 
 INTERACTIONS: Final = 400_000
-"""Largest total number of interactions that are shown; if there are more, fewer paths per link are shown."""
+"""Maximum total number of interactions shown; if there are more, fewer paths per link are shown."""
 
 TRIANGLES: Final = 250_000
-"""Largest number of triangles that are drawn; the largest triangles are drawn first."""
+"""Maximum number of triangles drawn; if there are more, the largest triangles are drawn."""
 
 STEPS: Final = np.iinfo(np.uint16).max
 
@@ -48,9 +48,9 @@ class Rays:
         paths: The strongest paths of every link, in descending order of power.
         vertex: Interaction points of the paths [I, 3], [m].
         gain_db: Power gain of the paths with the exported materials, without nuisances [P], [dB].
-        per_link: Largest number of paths per link.
+        per_link: Maximum number of paths per link.
         traced: Number of traced paths.
-        links_by_material: Number of links with at least one traced path that interacts with the material, by material.
+        links_by_material: Number of links with at least one traced path that interacts with a material, by material.
     """
 
     paths: Paths
@@ -62,10 +62,10 @@ class Rays:
 
 
 def with_stored_paths(result: Record, ledger: Path) -> Record:
-    """A result with the paths in its ledger, from the call at the calibrated values or else the initial values.
+    """Add paths from the ledger to a result: those of the call at the calibrated values or else at the initial values.
 
-    The result is unchanged if its engine returns no rays, the study can no longer be opened, or its scene and links do
-    not belong to a call in the ledger.
+    The result is unchanged if its engine returns no rays, if the study can no longer be opened, or if the ledger
+    contains no call with the study's scene and links.
     """
     if not result.study.engine.exports_rays or result.paths is not None or not ledger.is_file():
         return result
@@ -86,7 +86,7 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
     """Find the strongest paths of every link; paths missing from the result are read from the cache or traced.
 
     Raises:
-        InputError: The scene or the links of the study can no longer be used, or have changed.
+        InputError: The scene or the links of the study can no longer be used or have changed.
         EngineError: The ray tracer failed.
     """
     paths = result.paths
@@ -103,12 +103,12 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
 def strongest(paths: Paths, result: Record) -> Rays:
     """Select the strongest paths of every link with the exported materials."""
     gain = path_gains(paths, result.scene_materials).reshape(paths.num_paths, -1)
-    # Summed over receive ports and averaged over transmit ports, as in path loss.
+    # As for path loss, power is summed over receive ports and averaged over transmit ports.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
     gain_db = 10 * np.log10(np.maximum(power, 1e-40))
     order = np.lexsort((-gain_db, paths.link))
     link = paths.link[order]
-    # Rank of every path within its link, 0 for the strongest.
+    # Rank of every path within its link; the strongest path has rank 0.
     rank = np.arange(len(link)) - np.searchsorted(link, link)
     # Total number of interactions if every link keeps its 1, 2, ... strongest paths.
     interactions = np.cumsum(
@@ -116,7 +116,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
     )
     per_link = int(np.clip(np.searchsorted(interactions, INTERACTIONS, side="right"), 1, PER_LINK))
     chosen = order[rank < per_link]
-    # A link counts once for a material, however many of its paths interact with it.
+    # A link counts once for a material, however many of its paths interact with the material.
     link_and_material = np.stack([np.repeat(paths.link, np.diff(paths.first)), paths.material], axis=1)
     links = np.bincount(np.unique(link_and_material, axis=0)[:, 1], minlength=len(paths.materials))
     shown = take(paths, chosen)
@@ -132,20 +132,20 @@ def strongest(paths: Paths, result: Record) -> Rays:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid to which positions are rounded: its lower corner [3], and its spacing in all directions [m]."""
+    """A grid to which positions are rounded, given by its lower corner [3] and its spacing in all directions [m]."""
 
     low: NDArray[np.float64]
     step: float
 
     @classmethod
     def over(cls, *points: NDArray[np.float64]) -> Grid:
-        """The smallest grid that contains all points [n, 3], [m]."""
+        """Make the smallest grid that contains all points [n, 3], [m]."""
         positions = np.concatenate([part.reshape(-1, 3) for part in points])
         low, high = positions.min(axis=0), positions.max(axis=0)
         return cls(low, float(max((high - low).max(), 1.0) / STEPS))
 
     def steps(self, points: NDArray[np.float64]) -> NDArray[np.uint16]:
-        """Positions as whole numbers of steps [n, 3]."""
+        """Convert positions to whole numbers of grid steps [n, 3]."""
         return np.clip(np.rint((points - self.low) / self.step), 0, STEPS).astype(np.uint16)
 
 
@@ -154,7 +154,7 @@ def packed(
 ) -> dict[str, Any]:
     """Data for the viewer; arrays are little-endian integers in base64.
 
-    `materials` are the materials of the scene, in its order; triangles and rays are None if not available.
+    `materials` lists the materials in the order of the scene; triangles and rays are None if not available.
     """
     points = [survey.tx, survey.rx]
     if triangles is not None and len(triangles.face):
@@ -173,7 +173,7 @@ def packed(
 
 
 def _mesh(triangles: Triangles, grid: Grid, materials: list[str]) -> dict[str, Any]:
-    """The triangles, first those of the ground, then by material; vertices at the same grid point are merged."""
+    """Order the triangles, first those of the ground, then by material; vertices at the same grid point are merged."""
     area = np.linalg.norm(triangles.normal, axis=1)
     kept = np.sort(np.argsort(-area, kind="stable")[:TRIANGLES])
     part = np.where(triangles.ground[kept], 0, 1 + triangles.material[kept])

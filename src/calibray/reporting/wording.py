@@ -24,7 +24,7 @@ from calibray.uncertainty.verdicts import TRADE_OFF
 
 
 def prediction_text(record: Record) -> str:
-    """The prediction model, described in at most three sentences."""
+    """Describe the prediction model in at most three sentences."""
     model = record.prediction.model
     if model.parameters is None:
         source = _unused(record)
@@ -43,32 +43,32 @@ def prediction_text(record: Record) -> str:
     if fallback is None:
         return text
     error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"
-    return f"{text} Predictions for links without a path use the log-distance model{error}. They are marked."
+    return f"{text} For links without a path, predictions use the log-distance model{error} and are marked."
 
 
 _AVERAGED: Final = {
-    Model.AVERAGE_INITIAL: "the initial ones (weight 1/3)",
-    Model.AVERAGE_CALIBRATED: "the calibrated ones",
-    Model.AVERAGE_OFFSETS: "those of a fit with a prior and offsets",
+    Model.AVERAGE_INITIAL: "the initial materials (weight 1/3)",
+    Model.AVERAGE_CALIBRATED: "the calibrated materials",
+    Model.AVERAGE_OFFSETS: "the materials of a fit with a prior and offsets",
     Model.AVERAGE_LOG_DISTANCE: "the log-distance model",
     Model.AVERAGE_OBSTRUCTION: "the log-distance model with obstruction",
 }
 
 
 def _unused(record: Record) -> str:
-    """Unused inputs of a prediction model without materials; the model with obstruction uses walls and roofs."""
+    """Name the inputs that a model without materials does not use; the model with obstruction uses walls and roofs."""
     return "no materials" if record.prediction.model.name == Model.OBSTRUCTION else "no scene"
 
 
 def carriers_text(record: Record) -> str:
-    """The carriers of the links: the carrier of the scene, unless the links state carriers."""
+    """List the carrier frequencies of the links: that of the scene, unless the links state carrier frequencies."""
     if "frequency" not in record.links:
         return hertz(record.study.scene.frequency)
     return named(map(hertz, np.unique(record.links["frequency"].to_numpy(float)).tolist()))
 
 
 def group_text(record: Record, label: str) -> str:
-    """The label of an offset's group; in GHz or MHz if the groups are the carriers of the links."""
+    """The label of an offset group; if the groups are the carriers of the links, the label is in GHz or MHz."""
     column = record.study.links.frequency
     if column is None or record.study.offset_groups != (column,):
         return label
@@ -79,14 +79,14 @@ def group_text(record: Record, label: str) -> str:
 
 
 def usable_link_text(record: Record) -> str:
-    """What a link needs to determine the offset of its group."""
+    """State what a link needs so that it determines the offset of its group."""
     return "a path" + (" and a power well above the noise floor" if "faint" in record.links else "")
 
 
 def scene_alone_text(record: Record) -> str:
-    """The difference between the exported scene alone and the predictions.
+    """State how path loss from the exported scene alone differs from the predictions.
 
-    The text has at most three sentences, and is empty if the scene alone reproduces the predictions.
+    The text has at most three sentences; it is empty if the scene alone reproduces the predictions.
     """
     links, model = record.links, record.prediction.model
     scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
@@ -97,8 +97,8 @@ def scene_alone_text(record: Record) -> str:
     near = (
         ""
         if field is None
-        else f" Within about {field.range_m:.3g} m of measured links, predictions also add the "
-        "correlated part of their residuals, which a scene cannot contain (standard deviation in the fitted model: "
+        else f" Within about {field.range_m:.3g} m of measured links, predictions also add the correlated part of the "
+        "residuals of these links, which a scene cannot contain (standard deviation in the fitted model: "
         f"{field.shared_db:.2f} dB)."
     )
     if record.study.engine.external and model.parameters is not None:
@@ -134,7 +134,7 @@ def scene_alone_text(record: Record) -> str:
 
 
 def method_text(record: Record, name: str) -> str:
-    """The name of a calibration's method; for `auto` on an expensive engine, also the method that was used."""
+    """The name of a calibration's method; for `auto` with an expensive engine, also the method that was used."""
     if name != AUTO or not record.study.engine.expensive:
         return label(name)
     if record.study.engine.exports_rays:
@@ -143,16 +143,16 @@ def method_text(record: Record, name: str) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """Reasons why the path loss of the exported scene can differ from the reported one; empty if there are none."""
+    """State why path loss of the exported scene can differ from reported path loss; empty if there is no reason."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []
     if trace.adaptive:
         causes.append(
             f"The exported script launches {type(trace).samples:,} rays, but a calibration with trace.samples "
-            '= "auto" adds as many as necessary.'
+            '= "auto" adds rays until path loss converges.'
         )
-    # Paths that were traced again with the calibrated materials are those of the exported scene.
+    # Paths that were traced again with the calibrated materials are also the paths of the exported scene.
     sampled = record.study.engine.name == "replay" and (trace.refraction or trace.diffuse_reflection)
     if sampled and not (calibrated and record.fit.retrace_gap_db is not None):
         causes.append(
@@ -172,7 +172,7 @@ def sampling_text(record: Record) -> str:
 
 
 def held_out_text(record: Record) -> str:
-    """The number of held-out links, as text."""
+    """State the number of held-out links."""
     held_out = record.held_out
     if held_out is None:
         return f"{record.counts['held_out']:,} of them held out"
@@ -180,12 +180,12 @@ def held_out_text(record: Record) -> str:
 
 
 def block_sentence(held_out: HeldOutErrors) -> str:
-    """The number of held-out blocks, as a sentence."""
+    """State the number of held-out blocks in a sentence."""
     return f"{len(held_out.labels)} blocks of links were held out in turn."
 
 
 DECIDING: Final = 0.5
-"""Leverage above which a link is reported as determining an unknown almost alone."""
+"""Leverage above which the report states that a link determines an unknown almost alone."""
 
 
 CLEAR: Final = 2.0
@@ -239,7 +239,7 @@ def _distance_text(result: Record) -> str:
     distance = link_distance(links)
     if distance is None or len(residuals) < FEW or np.ptp(distance) == 0:
         return ""
-    # A least-squares line over the logarithm of distance; its two coefficients use two degrees of freedom.
+    # A least-squares line over the logarithm of distance is fitted; its two coefficients use two degrees of freedom.
     decades = np.log10(distance) - np.log10(distance).mean()
     slope = float(decades @ residuals / (decades @ decades))
     rest = residuals - residuals.mean() - slope * decades
@@ -249,7 +249,7 @@ def _distance_text(result: Record) -> str:
 
 
 def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callable[[Any], str]) -> str:
-    """The class of links with the largest mean residual."""
+    """Describe the class of links with the largest mean residual."""
     if column not in tables or len(tables[column]) < 2:
         return ""
     # The mean of one or two links is mostly noise.
@@ -267,7 +267,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callabl
 
 
 def _obstruction_text(table: pd.DataFrame) -> str:
-    """Mean residual of links in sight, and of links out of sight by the length of the line below roofs."""
+    """State the mean residual of links in sight, and of links out of sight by the length of the line below roofs."""
     parts = []
     for row in table.to_dict("records"):
         digits = 0 if row["to_m"] - row["from_m"] >= 1.0 else 1
@@ -278,7 +278,7 @@ def _obstruction_text(table: pd.DataFrame) -> str:
 
 
 def _missing_region_text(table: pd.DataFrame) -> str:
-    """The region whose extra loss would explain the residuals, if it explains more than expected by chance."""
+    """Describe the region whose extra loss would explain the residuals, if it explains more than expected by chance."""
     row = table.iloc[0]
     if not row["significant"]:
         return "no region of extra loss, such as trees, would explain more of the residuals than chance does"
@@ -292,15 +292,16 @@ def _missing_region_text(table: pd.DataFrame) -> str:
 def _neighbours_text(table: pd.DataFrame, field: ResidualField | None) -> str:
     if len(table) < 3:
         return ""
-    # Distant links share no errors, so half their mean squared difference is the full variance (the sill). Neighbours
-    # differ by less, to the extent that they share errors.
+    # Distant links share no errors, so half the mean squared difference between them is the full variance (the sill).
+    # Neighbouring links differ by less, to the extent that they share errors.
     nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
     share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
     # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
     if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
         if field is None:
             return f"the errors of links {nearest['distance_m']:.0f} m apart show no significant correlation"
-        # The fitted model uses all pairs, so it can detect a correlation that the nearest pairs alone do not show.
+        # The fitted model uses all pairs, so the model can detect a correlation that the nearest pairs alone do not
+        # show.
         decay = np.exp(-nearest["distance_m"] / field.range_m)
         share = decay * field.shared_db**2 / (field.shared_db**2 + field.own_db**2)
     return f"links {nearest['distance_m']:.0f} m apart share {percent(share)} of the variance of their errors"
@@ -314,8 +315,8 @@ def _leverage_text(table: pd.DataFrame) -> str:
         return f"{links} an unknown almost alone (leverage above {DECIDING:g}): {rows}"
     largest = table.iloc[int(np.argmax(table["leverage"]))]
     return (
-        f"no link determines an unknown alone; the largest leverage is {largest['leverage']:.2f}, "
-        f"in row {largest['row']:.0f}"
+        f"no link determines an unknown alone; the largest leverage is {largest['leverage']:.2f}, in row "
+        f"{largest['row']:.0f}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Load the calibrated scene in Sionna RT without Calibray, and compare its path loss with the reported one.
+"""Load the calibrated scene in Sionna RT without Calibray, and compare its path loss with the reported path loss.
 
 Usage: python load_scene.py [ROW ...]
 
@@ -19,7 +19,8 @@ import sionna.rt as rt
 from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.radio_materials import scattering_pattern_registry
 
-# The solver detects repeated paths by hashes, and loses paths whose hashes collide in its table of a million entries.
+# The solver detects repeated paths by their hashes; paths whose hashes collide in its table of a million entries are
+# lost.
 SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 67_108_859
 
 FOLDER = Path(__file__).resolve().parent
@@ -30,11 +31,11 @@ CALIBRATION = json.loads((FOLDER / "calibration.json").read_text(encoding="utf-8
 
 
 def load() -> rt.Scene:
-    """The calibrated scene at its carrier, with the antennas of the calibration."""
+    """Load the calibrated scene at its carrier frequency, with the antennas used in the calibration."""
     scene = rt.load_scene(str(FOLDER / "scene.xml"))
     scene.frequency = CALIBRATION["frequency_hz"]
     for name, pattern in CALIBRATION["scattering_patterns"].items():
-        # Scene files can contain only the Lambertian pattern.
+        # Scene files can state only the Lambertian scattering pattern.
         scene.radio_materials[name].scattering_pattern = scattering_pattern_registry.get(pattern.pop("name"))(
             **pattern
         )
@@ -54,7 +55,7 @@ def load() -> rt.Scene:
 
 
 def path_losses(scene: rt.Scene, tx: list[float], receivers: list[list[float]]) -> list[float]:
-    """Path loss [dB] from one position to several [m], without offset; infinite without a path."""
+    """Path loss [dB] from one position to several positions [m], without offset; infinite if there is no path."""
     for name in list(scene.transmitters) + list(scene.receivers):
         scene.remove(name)
     antennas = CALIBRATION["antennas"]
@@ -71,7 +72,7 @@ def path_losses(scene: rt.Scene, tx: list[float], receivers: list[list[float]]) 
 
 
 def received(gain: np.ndarray, delay: np.ndarray) -> float:
-    """Power gain from path gains [receive ports, transmit ports, paths] and delays [s], combined as in the study."""
+    """Combine path gains [receive ports, transmit ports, paths] with delays [s] to a power gain, as in the study."""
     if CALIBRATION["combining"] == "power" or not len(delay):
         return float((np.abs(gain) ** 2).sum() / gain.shape[1])
     offset, weight = np.zeros(1), np.ones(1)
@@ -84,7 +85,7 @@ def received(gain: np.ndarray, delay: np.ndarray) -> float:
 
 
 def batches(links: list[dict[str, str]]) -> list[list[dict[str, str]]]:
-    """Batches of links with the same transmitter, each for one call of the solver."""
+    """Divide links into batches with the same transmitter; each batch takes one call of the solver."""
     solver = CALIBRATION["solver"]
     lanes = solver["samples_per_src"] * max(solver["max_depth"], 1)
     # Diffuse paths of one receiver can fill the solver's buffer.
@@ -96,11 +97,11 @@ def batches(links: list[dict[str, str]]) -> list[list[dict[str, str]]]:
 
 
 def main() -> None:
-    """Print the reported and the computed path loss of links, and the largest difference."""
+    """Print the reported and the computed path loss of the links, and the largest difference between the two."""
     if CALIBRATION.get("mounted"):
         sys.exit(
-            "Antennas differ between the links of this study: the scene can be loaded, but path loss cannot be "
-            "computed here for comparison."
+            "Antennas differ between the links of this study, so this script can load the scene but cannot compute "
+            "path loss for comparison."
         )
     with (FOLDER / "links.csv").open(encoding="utf-8", newline="") as file:
         links = list(csv.DictReader(file))
@@ -110,10 +111,13 @@ def main() -> None:
     links = [link for link in links if not wanted or link["row"] in wanted]
     carrier = CALIBRATION["frequency_hz"]
     for link in [link for link in links if float(link.get("frequency") or carrier) != carrier]:
-        print(f"{link['row']}: left out, because its carrier is not that of the scene", file=sys.stderr)
+        print(
+            f"row {link['row']}: left out, because the carrier of this link is not that of the scene",
+            file=sys.stderr,
+        )
         links.remove(link)
     parts = batches(links)
-    print(f"{len(links)} links in {len(parts)} calls of the solver", file=sys.stderr)
+    print(f"links: {len(links)}, calls of the solver: {len(parts)}", file=sys.stderr)
     scene, largest, done, started = load(), 0.0, 0, time.monotonic()
     print("row,reported_db,computed_db")
     for part in parts:
@@ -122,12 +126,12 @@ def main() -> None:
             for end, link in [("tx", part[0]), *(("rx", link) for link in part)]
         )
         for link, rx, scene_db in zip(part, receivers, path_losses(scene, tx, receivers), strict=True):
-            # The nuisance is what the predictions add to the scene's path loss (calibration.json).
+            # Predictions add the nuisance to the scene's path loss (see calibration.json).
             nuisance, reported = float(link["nuisance_db"]), float(link["reported_db"])
             computed = scene_db + nuisance
             if len(part) > 1 and np.isfinite(reported) and not abs(computed - reported) < CLOSE_DB:
-                # The solver detects repeated paths by hashes. The receivers of a call determine which paths collide and
-                # are lost.
+                # The solver detects repeated paths by their hashes. The receivers of a call determine which paths
+                # collide and are lost.
                 computed = path_losses(scene, tx, [rx])[0] + nuisance
             print(f"{link['row']},{reported:.4f},{computed:.4f}")
             if np.isfinite(reported):
