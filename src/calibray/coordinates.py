@@ -56,7 +56,8 @@ class Frame:
         if not projection.is_projected or axes != {("east", "metre"), ("north", "metre")}:
             raise InputError(
                 f"crs = {self.crs!r}: {projection.name} is not a projection in metres with x pointing east and y "
-                "pointing north; give one, such as the UTM zone EPSG:326xx, or omit crs to use a local projection"
+                "pointing north; give such a projection, for example the UTM zone EPSG:326xx, or omit crs to use a "
+                "local projection"
             )
 
     @classmethod
@@ -78,7 +79,7 @@ class Frame:
     def utm(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
         """Make the frame of the UTM zone that contains a point, with the origin rounded to whole metres.
 
-        The arguments are those of `local`.
+        The arguments are the same as for `local`.
 
         Raises:
             InputError: The longitude or the latitude is out of range, or the point is too close to a pole for UTM.
@@ -107,7 +108,7 @@ class Frame:
         return cls(record["crs"], *(float(record[key]) for key in keys))
 
     def record(self) -> dict[str, str | float]:
-        """The frame as a dictionary for JSON."""
+        """Convert the frame to a dictionary that JSON can store."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -250,5 +251,5 @@ def _check_degrees(
 
 
 def _name(index: int, rows: NDArray[np.int64] | None) -> str:
-    """The name of a position in error messages."""
+    """Describe a position for error messages."""
     return f"position {index}" if rows is None else f"row {rows[index]}"

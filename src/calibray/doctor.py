@@ -28,7 +28,7 @@ _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
 # Optional dependencies for developing Calibray itself; users do not need them.
 _DEVELOPER_EXTRAS = frozenset({"test", "docs", "lint"})
 
-# Sum of min(0, 2) to min(3, 2). An unusable LLVM cannot compile the minimum, although it can compile a sum.
+# Sum of min(0, 2) to min(3, 2). An unusable LLVM cannot compile `minimum`, although it can compile `sum`.
 _KERNEL = """
 import importlib, sys
 import drjit
@@ -174,7 +174,8 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
     if run.returncode < 0:
         # LLVM prints the reason first, then a stack trace.
         return Check(name, False, f"killed by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
-    # In a chain of exceptions, the first exception is the cause. An exit message is the last line.
+    # In a chain of exceptions, the first exception is the cause. If there is no exception, the last line is the exit
+    # message.
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)] or lines[-1:]
     return Check(name, False, "; ".join(reasons), remedy)
 

@@ -107,7 +107,7 @@ exponent of 127 would give infinite or undefined gains."""
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"lambertian": (), "directive": ("alpha_r",), "backscattering": ("alpha_r", "alpha_i", "lambda_")}
 )
-"""Scattering patterns, each with the fields that it depends on."""
+"""Scattering patterns, each with the fields on which the pattern depends."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Material:
     """The radio constants of a surface, modelled as a slab of a homogeneous, non-magnetic medium.
 
     Attributes:
-        relative_permittivity: Real part of the relative permittivity [1], at least 1.
+        relative_permittivity: Real part of the relative permittivity [1]; at least 1.
         conductivity: Conductivity [S/m], at least 0.
         thickness: Thickness of the slab [m], greater than 0.
         scattering_coefficient: Scattering coefficient S [1], the fraction of the reflected amplitude that is scattered
@@ -197,7 +197,7 @@ class ItuLaw(NamedTuple):
 
 
 def frequency_independent_law(material: Material) -> ItuLaw:
-    """The law of a material whose constants are the same at all frequencies."""
+    """The law of a material with the same constants at all frequencies."""
     return ItuLaw(0, inf, material.relative_permittivity, 0.0, material.conductivity, 0.0)
 
 

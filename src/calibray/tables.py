@@ -217,7 +217,7 @@ def _lines(table: Table) -> str:
     for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
         # The first column contains the names of the rows; the only column of a table contains sentences.
         is_text = column.align == "left" and (index > 0 or len(table.columns) == 1)
-        # Rich takes the longest word as the minimum width, even where a cell must not wrap.
+        # Rich uses the longest word as the minimum width, even for a cell that must not wrap.
         cells = (heading, *(row[index] for row in table.rows))
         least = None if is_text else max(cell_len(printable(cell)) for cell in cells)
         grid.add_column(

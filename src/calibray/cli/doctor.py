@@ -86,7 +86,7 @@ def _draw(study: Study, plot: Path, overwrite: bool) -> None:
 
 
 def cache(clear: Annotated[bool, typer.Option("--clear", help="Remove all cached files.")] = False) -> None:
-    """Show where traces and compiled programs are kept between runs, or remove them.
+    """Show the folder in which traces and compiled programs are kept between runs, or remove these files.
 
     The environment variable CALIBRAY_CACHE sets the cache folder. If this variable is set but empty, Calibray caches
     nothing.

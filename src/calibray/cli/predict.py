@@ -193,7 +193,7 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
 
 @dataclass(frozen=True)
 class SuggestOptions:
-    """Options for the suggestions and their output."""
+    """Options for the suggestions and for their output."""
 
     count: Annotated[int, option("N", "Maximum number of links to suggest.", min=1)] = 5
     out: Annotated[
@@ -300,7 +300,7 @@ def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
 
 @dataclass(frozen=True)
 class Area:
-    """Options for the transmitter and the receivers of a map."""
+    """Options for the transmitter, the receivers and the area of a map."""
 
     tx: Annotated[
         tuple[float, float, float] | None,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Changes:
-    """Options that override those of the study."""
+    """Options that override settings of the study."""
 
     method: Annotated[
         str | None, option("NAME", "Method to use instead of the study's method: auto, sgwo-im, gwo, ...")
@@ -71,7 +71,7 @@ class RunPool:
 
 @dataclass(frozen=True)
 class Output:
-    """Options for the printed and written output."""
+    """Options for the output that is printed or written to files."""
 
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")] = (
         False
@@ -92,7 +92,7 @@ def run(
 ) -> None:
     """Calibrate a study, print the result, and write the result, the calibrated scene and a report."""
     try:
-        # Importing libraries and reading the scene also take seconds, so the progress display starts here.
+        # Importing libraries and reading the scene also take several seconds, so the progress display starts here.
         with progress_bars(log()) as progress:
             from calibray.calibration.calibrate import calibrate
             from calibray.engines import open_workers

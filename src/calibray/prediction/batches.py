@@ -42,7 +42,7 @@ CHUNKS_PER_BATCH: Final = 100
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """The input of a worker: the calibration, its opened study, and the requested columns."""
+    """The input of a worker: the calibration, the opened study, and the requested columns."""
 
     result: Record
     setup: Setup

@@ -112,10 +112,10 @@ def nuisance_shift(
     A group without a coefficient is assigned the mean of the n coefficients. For such a group, the standard deviation s
     between groups is enlarged by the uncertainty of the mean, to s sqrt(1 + 1 / n). With `new_groups`, groups without a
     coefficient are also allowed in terms without an estimated spread. New transmitters are always allowed, because no
-    column identifies transmitters. `draws` contains posterior draws by coefficient.
+    column identifies transmitters. `draws` contains posterior draws by the name of the coefficient.
 
     Raises:
-        InputError: A group has no coefficient, and `new_groups` is False.
+        InputError: A group has no coefficient although `new_groups` is False.
     """
     draws = draws or {}
     num_draws = len(next(iter(draws.values()), ()))

@@ -70,7 +70,7 @@ def coverage_map(
         bounds: West, south, east and north bounds of the area [4], [m]; if None, the bounds of the scene.
         level: Probability that the interval contains a measurement; None for no interval.
         power_dbm: Transmitted power, for a map of received power [dBm]; if None, the map shows path loss. After a
-            calibration on RSRP, the default is 0, because the offset contains the power.
+            calibration on RSRP, the default is 0, because the offset contains the transmitted power.
         samples: Number of rays; if None, the number in the study. Too few rays miss paths; the computing time is
             proportional to the number of rays. "auto" adds rays until path loss converges, which is faster than using a
             large number of rays from the start.
@@ -153,7 +153,7 @@ def coverage_map(
         if not start and predictions["basis"].str.contains(NEW_GROUP).any():
             stated = ", ".join(f"{name} = {value}" for name, value in constants.items())
             _LOG.warning("%s: no link of this group was measured, so the map uses the mean offset", stated)
-    # In an outdoor study, the log-distance model does not apply inside buildings.
+    # In an outdoor study, the log-distance model is not valid inside buildings.
     without_scene = no_path | (result.prediction.model.parameters is None)
     if without_scene.any() and not is_indoors(result, triangles):
         inside = np.zeros(len(rx), dtype=bool)

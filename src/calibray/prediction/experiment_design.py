@@ -12,13 +12,13 @@ Statistical Science 10, 1995). The standard deviations are computed in two ways,
 
 The scatter is uninformative if a range of a parameter contains few draws. If several separate ranges of a parameter fit
 the links, the probability of ruling out all but one of these ranges is therefore added to the rank. Each range contains
-values that explain the links measured so far. The excess of a value is its sum of squares minus that of the best value.
-At a candidate, the squared difference from the true value is added to this excess. The smallest total in a range is the
-sum of squares that a fit within this range would reach with all other parameters free. A range is ruled out if its
-smallest total exceeds that of the true range by more than the quantile used for intervals. For two models, this
-criterion is the T-optimal design (A. C. Atkinson and V. V. Fedorov, The design of experiments for discriminating
-between two rival models, Biometrika 62, 1975) with an expectation over the true value (G. E. P. Box and W. J. Hill,
-Discrimination among mechanistic models, Technometrics 9, 1967).
+values that explain the links measured so far. The excess of a value is its sum of squares minus the sum of squares of
+the best value. For a candidate, the squared difference between the predictions of this value and of the true value is
+added to the excess. The smallest total in a range is the sum of squares that a fit within this range would reach with
+all other parameters free. A range is ruled out if its smallest total exceeds that of the true range by more than the
+quantile used for intervals. For two models, this criterion is the T-optimal design (A. C. Atkinson and V. V. Fedorov,
+The design of experiments for discriminating between two rival models, Biometrika 62, 1975) with an expectation over the
+true value (G. E. P. Box and W. J. Hill, Discrimination among mechanistic models, Technometrics 9, 1967).
 
 Candidates are chosen one at a time. Part of the error is common to several candidates, because of an unknown offset or
 shared clutter. Conditioning after each choice removes this common part, so a second measurement at the same point adds
@@ -40,13 +40,13 @@ UNIFORM_INFORMATION: Final = 12.0
 measurement."""
 
 LEAST_VARIANCE: Final = 1e-5
-"""Variance in the unit cube that the scatter of about a hundred draws cannot resolve."""
+"""Variance in the unit cube below which the scatter of about a hundred draws has no resolution."""
 
 SEPARATION_WEIGHT: Final = 8.0
 """Weight of ruling out all but one range of a parameter, relative to narrowing the parameter by a factor of e."""
 
 RULED_OUT: Final = 4.3
-"""Excess of the sum of squares, in noise variances, above which a range is ruled out: F(0.95; 1, about 20)."""
+"""Excess of the sum of squares above which a range is ruled out, in noise variances: F(0.95; 1, about 20)."""
 
 EXCESS_DEVIATION: Final = 3.0
 """Standard deviation of the excess that the noise of the candidates' measurements causes, in noise variances."""
@@ -61,7 +61,7 @@ class Errors:
 
     Attributes:
         own_db: Standard deviation of the part of a candidate's error that is independent of other candidates [dB].
-        common: Effect of one standard deviation of each common unknown [candidates, unknowns], [dB].
+        common: Change in path loss per standard deviation of each common unknown [candidates, unknowns], [dB].
         position: Positions of the receivers, or of both ends [candidates, k], [m].
         shared_db: Standard deviation of the part of the error that neighbouring candidates share [dB]; 0 if they share
             none.
@@ -95,8 +95,8 @@ class Outlook:
 
     Attributes:
         index: The candidate.
-        narrowed: Standard deviation of every parameter relative to its value before any candidate is measured [d]; at
-            most 1.
+        narrowed: Standard deviation of every parameter, relative to that before any candidate is measured [d]; at most
+            1.
         range_probability: Probability that it is known in which of its separate ranges a parameter lies [d]; 1 if there
             is only one range.
         information: Information matrix of all links measured up to this candidate, at every draw [n, d, d].
@@ -117,7 +117,7 @@ class Beliefs:
         information: Information matrix of the links measured so far, at every draw [n, d, d].
         piece: Index of the separate range in which each parameter lies [m, d], first for the draws, then for further
             values that explain the links measured so far.
-        excess: Sum of squares of each draw and further value minus the smallest sum, in noise variances [m].
+        excess: Sum of squares of each draw and each further value, minus the smallest sum, in noise variances [m].
     """
 
     point: NDArray[np.float64]
@@ -170,7 +170,7 @@ def choose_candidates(
         best_slope = slope[:, best] / deviation[best]
         added = best_slope[:, :, None] * best_slope[:, None, :]
         beliefs = replace(beliefs, information=beliefs.information + added)
-        # Condition the other candidates on the chosen one: one step of a Cholesky factorization.
+        # Condition the other candidates on the chosen candidate, which is one step of a Cholesky factorization.
         covariance = errors.covariance(best) - conditioned.T @ conditioned[:, best]
         share = covariance / deviation[best]
         predicted -= best_predicted[:, None] * share

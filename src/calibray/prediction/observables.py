@@ -90,12 +90,12 @@ CHOICES: Final = (DELAY_SPREAD, EXCESS_DELAY, K_FACTOR, DEPARTURE_SPREAD, ARRIVA
 """Observables that depend on the materials and have no device bias."""
 
 RELATIVE_ERROR: Final = 0.1
-"""Expected error of a spread or an excess delay that the study does not contain, relative to the RMS of its values. In
+"""Expected error of a spread or an excess delay that the study does not measure, relative to the RMS of its values. In
 downtown Boulder, rotating the receiving array changes delay spreads by 3 % in line of sight and by 15 % out of
 sight."""
 
 ERROR_DB: Final = 1.0
-"""Expected error of a K-factor that the study does not contain [dB]."""
+"""Expected error of a K-factor that the study does not measure [dB]."""
 
 
 class Worth(NamedTuple):

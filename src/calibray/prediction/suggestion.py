@@ -121,7 +121,7 @@ def suggest(
     links = as_links(result, candidates)
     warn_of_carriers(result, links)
     calibrated = Setup.open(study).placed_at(result.parameters, NEIGHBOURS)
-    # The calibration links and the candidates share one loaded tracer.
+    # The calibration links and the candidates share a single loaded tracer.
     setup = calibrated.at(links)
     check_inputs(result, setup, allow_changed_inputs)
     if not allow_changed_inputs and not has_links(result, calibrated.links):
@@ -179,7 +179,7 @@ def _received(
     All of `reached` is returned if the study has no noise floor, or if the candidates' transmitted power is unknown.
 
     Raises:
-        InputError: No candidate has enough predicted power.
+        InputError: The predicted power of all candidates is too low.
     """
     floor = result.study.links.noise_floor_dbm
     powers = as_measured(result.study, links, pd.DataFrame({"path_loss_db": path_loss_db}))

@@ -37,7 +37,7 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     Returns:
         Tables by name; a table that cannot be computed is omitted. "distance", "depth" and "group": number of links,
         mean and standard deviation of the residuals [dB] on the calibration links. Residuals are predicted minus
-        measured values of the measured quantity. "obstruction" and "streets": the same values, by the length of the
+        measured values of the measured quantity. "obstruction" and "streets": the same statistics, by the length of the
         straight line below roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra
         loss would explain the largest part of the residuals. "leverage": leverage and residual of every calibration
         link. "power": share of the links' power by material and type of interaction. "trade_offs": correlation of the
@@ -80,7 +80,7 @@ def _by_distance(result: Record) -> pd.DataFrame:
     distance = link_distance(links)
     if distance is None or len(residuals) < FEW:
         return pd.DataFrame()
-    # Each class has at least four links.
+    # Each class contains at least four links.
     classes = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(residuals) // 4))
     return pd.DataFrame(
         [

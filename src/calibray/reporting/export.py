@@ -1,4 +1,4 @@
-"""Export of the calibrated scene for Sionna RT without Calibray, and of its materials as tables for other tools."""
+"""Export of the calibrated scene for use in Sionna RT without Calibray, and of its materials as tables."""
 
 from __future__ import annotations
 

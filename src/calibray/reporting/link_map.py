@@ -48,7 +48,7 @@ OUTLINED: Final = 400
 
 @dataclass(frozen=True)
 class Plan:
-    """Layout of the map for the template.
+    """Layout of the map that the template draws.
 
     Attributes:
         height: Height in map units; the width is `WIDTH`.
@@ -193,7 +193,8 @@ def _walls(triangles: Triangles, layout: Plan) -> str:
     lines = sides[np.arange(len(sides)), longest]
     inside = (lines.max(axis=1) > 0).all(axis=1) & (lines.min(axis=1) < [WIDTH, layout.height]).all(axis=1)
     lines = lines[inside]
-    # Every line starts at the end with the smaller x, then y, so that the lines of both faces of a wall are identical.
+    # Every line starts at the end with the smaller x (or, if equal, y), so that both faces of a wall give identical
+    # lines.
     backwards = (lines[:, 0] > lines[:, 1]) @ [2, 1] > (lines[:, 0] < lines[:, 1]) @ [2, 1]
     lines[backwards] = lines[backwards][:, ::-1]
     lines = np.unique(lines.reshape(-1, 4), axis=0)

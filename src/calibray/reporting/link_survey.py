@@ -21,7 +21,7 @@ class Survey:
         table: The result's links.
         tx: Transmitters [L, 3], [m].
         rx: Receivers [L, 3], [m].
-        group: Names of the groups [L]; None without groups.
+        group: Name of each link's group [L]; None if the study has no groups.
         sign: 1 if path loss was measured; -1 if power or gain was measured.
     """
 
@@ -81,7 +81,7 @@ def measured_quantity(result: Record) -> Quantity:
 
 
 def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
-    """Values of the links in the measured quantity [L], in its unit.
+    """Values of the links in the measured quantity [L], in the unit of this quantity.
 
     `name` selects the values: "measured", "before", "after" or "predicted".
     """

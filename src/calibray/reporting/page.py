@@ -88,7 +88,7 @@ class PageData:
         scene: The scene; None if the scene can no longer be read.
         triangles: Meshes of the scene.
         rays: Paths of the links; None if no paths are available.
-        missing: Items that are not shown, with the reasons.
+        missing: Items that are not shown, each with the reason.
         regions: Regions of the study, by name.
     """
 
@@ -120,7 +120,7 @@ def report(
 
     Raises:
         InputError: The file's name does not end in .html or .htm, the file or the folder cannot be written, or a file
-            in it must not be replaced.
+            in the folder must not be replaced.
     """
     check_record(result)
     inputs = result.study.files()
@@ -188,7 +188,7 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
 
 
 def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
-    """The report as HTML, with figures by name."""
+    """Render the report as HTML; `figures` contains the figures by name."""
     environment = Environment(
         loader=PackageLoader("calibray.reporting"),
         autoescape=True,
@@ -246,7 +246,7 @@ def _title(study: Path) -> str:
 
 
 def _breakable(name: str) -> Markup:
-    """A parameter's name as HTML, with a line break allowed only after the material."""
+    """Convert a parameter's name to HTML that allows a line break only after the material."""
     material, dot, constant = name.rpartition(".")
     return escape(material) + dot + Markup("<wbr>") + escape(constant)
 

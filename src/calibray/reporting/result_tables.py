@@ -286,7 +286,7 @@ def values(result: Record) -> list[Value]:
 
 
 def nuisances_only(result: Record) -> str:
-    """The name of the model with the initial materials and fitted nuisances."""
+    """The short name of the model with the initial materials and fitted nuisances."""
     return "nuisances only" if _nuisances_besides_offset(result) else "offset only"
 
 

@@ -98,7 +98,7 @@ def assumptions(draft: Draft) -> Table:
 
 
 def warning_lines(findings: Sequence[Finding]) -> str:
-    """Findings about links as warnings, one per line."""
+    """Format findings about links as warnings, one per line."""
     return "\n".join(
         f"Warning: {finding.subject}: {finding.problem}; {finding.remedy}" for finding in findings
     )
@@ -107,7 +107,7 @@ def warning_lines(findings: Sequence[Finding]) -> str:
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
     """Numbers of links, paths and interactions, and the links to check, given by their rows in the file [L].
 
-    If `enclosed` is None, antennas were not checked.
+    If `enclosed` is None, the antennas were not checked.
     """
     reached = np.bincount(paths.link, minlength=paths.num_links) > 0
     rows = [
@@ -130,7 +130,7 @@ def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float
 
 
 def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
-    """The verdict on the last round of a trace that adds rays in rounds.
+    """State the verdict on the last round of a trace that adds rays in rounds.
 
     `settings` contains the trace settings of the paths; `tolerance_db` is the largest acceptable change in a link's
     path loss [dB].

@@ -36,7 +36,8 @@ PANELS: Final = 6
 first."""
 
 DEEPEST_DB: Final = -30.0
-"""Level of the pattern at the centre of a figure [dB]. The back lobe of a sector antenna is at about this level."""
+"""Level of the antenna pattern at the centre of a figure, relative to its maximum [dB]. The back lobe of a sector
+antenna is at about this level."""
 
 
 def trust_figures(result: Record) -> dict[str, Figure]:
@@ -189,7 +190,7 @@ def leverage(table: pd.DataFrame) -> Figure:
 def by_depth(table: pd.DataFrame) -> Figure:
     """Draw the mean residual by the number of interactions of the strongest path, with two standard errors."""
     figure, axes = style.residual_figure("Interactions of the strongest path")
-    # A single link has no standard error and therefore no bar.
+    # A single link has no standard error, so no error bar is drawn.
     error = table["standard_deviation_db"] / np.sqrt((table["links"] - 1).replace(0, np.nan))
     axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=style.BLUE, capsize=3)
     labels = [f"{row.depth:.0f}\n({row.links:,})" for row in table.itertuples()]

@@ -47,7 +47,7 @@ class Rays:
     Attributes:
         paths: The strongest paths of every link, in descending order of power.
         vertex: Interaction points of the paths [I, 3], [m].
-        gain_db: Power gain of the paths with the exported materials, without nuisances [P], [dB].
+        gain_db: Power gain of each path with the exported materials, without nuisances [P], [dB].
         per_link: Maximum number of paths per link.
         traced: Number of traced paths.
         links_by_material: Number of links with at least one traced path that interacts with a material, by material.
@@ -152,7 +152,7 @@ class Grid:
 def packed(
     survey: Survey, triangles: Triangles | None, rays: Rays | None, materials: list[str]
 ) -> dict[str, Any]:
-    """Data for the viewer; arrays are little-endian integers in base64.
+    """Pack the data for the viewer; arrays become little-endian integers in base64.
 
     `materials` lists the materials in the order of the scene; triangles and rays are None if not available.
     """

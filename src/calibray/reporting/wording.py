@@ -1,4 +1,4 @@
-"""Sentences about predictions and held-out links, for the report, its summary and the export."""
+"""Sentences about predictions and held-out links, for the report, the summary and the export."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)
-"""The files whose digests `result.json` contains."""
+"""The files for which `result.json` contains digests."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ def write(
     ignores both.
 
     Raises:
-        InputError: The folder cannot be written, or a file there must not be replaced.
+        InputError: The folder cannot be written, or a file in it must not be replaced.
     """
     target = check_outputs(folder, (*FILES, VALIDATION_FILE), record.study.files(), overwrite)
     try:
@@ -180,7 +180,7 @@ def write(
 
 
 def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str, Any]:
-    """Read the fields of a `Record` from a folder written by `write`.
+    """Read the fields of a `Record` from a folder that `write` wrote.
 
     With `allow_changed_inputs`, files that were edited after the run are accepted.
 
@@ -204,7 +204,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
 
 def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> None:
-    """Reject files from several runs, and edited files unless edits are allowed."""
+    """Reject files that come from several runs and, unless edits are allowed, files that were edited."""
     for name in SIGNED_FILES:
         file = folder / name
         if name not in digests:
@@ -239,7 +239,7 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
             "study again"
         )
     try:
-        # In JSON mode Pydantic accepts lists as tuples and converts nothing else.
+        # In JSON mode, Pydantic accepts lists as tuples but converts no other types.
         stored = Stored.model_validate_json(json.dumps(values))
     except RecursionError:
         raise InputError(f"{source}: is nested too deeply; run the study again") from None
@@ -403,7 +403,7 @@ def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
-    """Read the held-out errors of a result; None if the result was not validated.
+    """Read the held-out errors of a result; the result is None if no validation was written.
 
     `measured_db` is the measured path loss of the result's links [links], [dB].
 
@@ -482,7 +482,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         if column not in table:
             raise InputError(f"{file}: has no column {column!r}; run the study again")
         actual = table[column].dtype.kind
-        # Integers are valid floats. In a table without rows, columns have no kind to check.
+        # Integers are valid floats. In a table without rows, the columns have no kind that could be checked.
         if len(table) and actual != kind and not (kind == "f" and actual == "i"):
             raise InputError(f"{file}: column {column!r} has values of the wrong type; run the study again")
         if kind == "f":
@@ -494,5 +494,5 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     numeric = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in OPTIONAL]
     if invalid := [column for column in numeric if table[column].dtype.kind not in "if"]:
         raise InputError(f"{file}: column {invalid[0]!r} has values of the wrong type; run the study again")
-    # Whole metres are read as integers.
+    # Columns of whole metres are read as integers and must be converted.
     return table.astype(dict.fromkeys(numeric, float))

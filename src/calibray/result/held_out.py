@@ -74,7 +74,7 @@ AVERAGE_OF: Final[dict[str, Model]] = {
     Model.LOG_DISTANCE: Model.AVERAGE_LOG_DISTANCE,
     Model.OBSTRUCTION: Model.AVERAGE_OBSTRUCTION,
 }
-"""The average that replaces a chosen model in predictions."""
+"""The average that replaces a model in predictions if that model is chosen."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class ObservableErrors:
 
     Attributes:
         unit: The unit.
-        links: Number of held-out links with a value.
+        links: Number of held-out links for which the observable was measured.
         rmse: RMSE of the calibrated model.
         mean_rmse: RMSE of a baseline that predicts the mean value of the other links.
         distance_rmse: RMSE of a baseline that is linear in distance or its logarithm, fitted to the other links.
@@ -102,7 +102,7 @@ class HeldOutErrors:
 
     Attributes:
         labels: Names of the blocks.
-        block: Block of every link [links]; -1 if the link is not judged.
+        block: Index of the block of every link [links]; -1 if the link is not judged.
         errors: Modelled minus measured path loss by model name [links], [dB]; NaN if the link is not judged.
         position: Positions of the moving end of the links [links, 3], [m]; see `moving_end`.
         measured_db: Measured path loss [links], [dB].
@@ -155,7 +155,7 @@ class Judgement:
 
 
 NO_PATH: Final = "no path"
-"""Beginning of the text in the column `basis` of predictions for links without a path."""
+"""Beginning of the text in the column `basis` for links without a path."""
 
 NEW_GROUP: Final = "group without measurements"
 """Part of the text in the column `basis` of predictions that use the mean offset of the measured groups."""
@@ -195,7 +195,7 @@ class BlockErrors:
         blocks: Number of blocks.
         reach_m: 90 % quantile of the distance from a held-out link to the nearest calibration link [m].
         groups_db: RMS contribution of random effects to these errors, for groups that occur in only one block [dB].
-        out_of_sight: RMS error of links out of sight divided by that of all links; at least 1.
+        out_of_sight: RMS error of links out of sight, divided by the RMS error of all links; at least 1.
     """
 
     within_db: float

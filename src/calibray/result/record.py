@@ -42,7 +42,7 @@ class ObservableFit:
     Attributes:
         kind: Kind of the observable.
         unit: Unit of the observable.
-        links: Number of calibration links with a value.
+        links: Number of calibration links for which the observable was measured.
         rmse: RMSE of the calibrated model.
         initial_rmse: RMSE with the initial materials.
         mean_rmse: RMSE of a baseline that predicts the mean value for every link.
@@ -150,7 +150,7 @@ class Nuisance:
         coefficients: Coefficient by term and group, [dB] per unit of the term's column; the offset is the term
             "offset", and the group "" contains all links.
         centres: Value that is subtracted from a term's column, by term.
-        groups_without_path: Groups without an offset, because none of their calibration links has a path.
+        groups_without_path: Groups that have no offset, because none of their calibration links has a path.
     """
 
     coefficients: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -214,7 +214,7 @@ class Provenance:
     """The inputs of the calibration.
 
     Attributes:
-        files: SHA-256 of every file of the scene and the antennas, by path; empty if unknown.
+        files: SHA-256 digests of all files of the scene and the antennas, by path; empty if unknown.
         rows: Numbers of table rows that were left out, averaged or moved when the rows were converted to links, by
             cause.
         enclosed: Antennas inside closed bodies of the scene or below the ground; None if antennas were not checked.
@@ -248,7 +248,7 @@ class Record:
         history: One row per RT call: number, iteration, RMSE, lowest RMSE so far, seconds since the start.
         held_out: Held-out errors of every model, if blocks were held out in turn; otherwise None.
         scene: The scene as it was read; None in a loaded result.
-        paths: The paths that were replayed, for drawing; None in a loaded result.
+        paths: The paths that were replayed, kept for drawing; None in a loaded result.
     """
 
     study: Study
@@ -312,7 +312,7 @@ class Record:
 
     @property
     def holdout_rmse_db(self) -> float | None:
-        """RMSE over the held-out links [dB]; None if no link is held out."""
+        """RMSE of the calibrated model over the held-out links [dB]; None if no link is held out."""
         return self.accuracy.holdout_rmse_db
 
     @property

@@ -56,7 +56,7 @@ class Reason:
 
     Attributes:
         kind: The kind of reason.
-        values: Numbers and names for the sentence; see `ReasonKind`.
+        values: Numbers and names that appear in the sentence; see `ReasonKind`.
         ranges: Ranges or modes in the sentence; the last number of each range or mode is its weight.
     """
 
@@ -75,9 +75,10 @@ class Interval:
             the lowest.
         upper: Upper end of the interval; if the interval has several pieces, the upper end of the highest.
         verdict: The verdict on the parameter.
-        pieces: Lower and upper end of every piece, ascending, if the interval was computed from draws.
+        pieces: Lower and upper ends of all pieces, in ascending order; empty if the interval was not computed from
+            draws.
         reason: The reason for the verdict.
-        approximate: Whether the interval comes from an emulator, because the engine provides no derivatives.
+        approximate: Whether the interval was computed with an emulator, because the engine provides no derivatives.
         seen: Pieces of the 95 % interval for only the buildings on the links' paths; these pieces apply to predictions.
             The tuple is empty if these pieces equal those for the mean over all buildings of this material.
         without: Share of the width that would remain if a cause were ruled out, by cause; causes with little effect are
@@ -149,12 +150,12 @@ class RemarkKind(StrEnum):
 
 
 Value = float | int | bool | str | list[str] | list[float] | list[list[float]]
-"""Types that the values of a remark can have; JSON can express all of them."""
+"""Types that the values of a remark can have; JSON can express all these types."""
 
 
 @dataclass(frozen=True)
 class Remark:
-    """A warning or a piece of advice; `RemarkKind` describes its values."""
+    """A warning or a piece of advice; `RemarkKind` describes the values of each kind."""
 
     kind: RemarkKind
     values: dict[str, Value] = field(default_factory=dict)

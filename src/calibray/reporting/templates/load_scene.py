@@ -2,8 +2,8 @@
 
 Usage: python load_scene.py [ROW ...]
 
-ROW is the row of a link in the measured table; without rows, all links are computed. This script requires Sionna RT and
-the other files of this folder, but not Calibray.
+ROW is the row number of a link in the measured table; if no rows are given, all links are computed. This script
+requires Sionna RT and the other files of this folder, but not Calibray.
 """
 
 from __future__ import annotations
