@@ -108,7 +108,7 @@ def test_a_link_without_a_path_gets_the_log_distance_model_s_prediction(shadowed
     assert predictions.path_loss_db[1] == pytest.approx(expected, abs=2.0)
     assert predictions.lower_db[1] < expected < predictions.upper_db[1]
     assert shadowed.predict(places(SEEN, HIDDEN)) == pytest.approx(predictions.path_loss_db.to_numpy())
-    assert "Predictions for links without a path" in prediction_text(shadowed)
+    assert "For links without a path, predictions use" in prediction_text(shadowed)
 
 
 def test_the_interval_without_a_path_is_not_narrower(shadowed: Result) -> None:

@@ -119,7 +119,8 @@ def test_the_fallback_predicts_where_no_path_leads(result):
     [
         (
             lambda links: links.assign(half="north"),
-            "group 'north' has no calibrated offset; the calibrated groups are east, west; with an interval \\(--level",
+            "group 'north' has no calibrated offset; the calibrated groups are east, west; to use the mean for "
+            "new groups, request an interval \\(--level",
         ),
         (lambda links: links.drop(columns="half"), "no column 'half'"),
         (lambda links: links.drop(columns="rx_z"), "no column 'rx_z'"),
@@ -178,7 +179,7 @@ def test_only_folders_with_a_result_are_loaded(folder, tmp_path):
     with pytest.raises(InputError, match="is not a result"):
         Result.load(folder)
     (folder / "result.json").write_text(text.replace('"version": 1,', '"version": 99,', 1))
-    with pytest.raises(InputError, match="version 99, must be 1; run the study again"):
+    with pytest.raises(InputError, match="version 99, but must have version 1; run the study again"):
         Result.load(folder)
 
 

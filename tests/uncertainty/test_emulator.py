@@ -91,7 +91,7 @@ def test_emulated_intervals_cover_the_truth(asked, tmp_path):
     )
     told = render(*tables.tables(loaded))
     assert ", approximate" in told
-    assert "an emulator was fitted to 31 of its calls" in " ".join(told.split())
+    assert "an emulator was fitted to 31 engine calls" in " ".join(told.split())
 
 
 def test_too_few_calls_give_the_whole_range(asked):
@@ -115,4 +115,4 @@ def test_calls_that_do_not_predict_one_another_give_the_whole_range(asked):
     for found in assessed.record.intervals.values():
         assert [found.lower, found.upper] == planted.BOUNDS
         assert found.reason.values["error_db"] > 0.5 * trail.best_value
-        assert "each call is predicted from the others with an error of" in reason_text(found.reason)
+        assert "predictions of each call from the others have an error of" in reason_text(found.reason)
