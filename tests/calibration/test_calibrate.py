@@ -24,6 +24,8 @@ from calibray.fitting.search import choose
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.reporting.result_tables import nuisances
+from calibray.reporting.summary import summary
+from calibray.reporting.wording import method_text
 from calibray.result.held_out import Model
 from calibray.result.verdict import RemarkKind
 from calibray.result.wording import judgement_text
@@ -134,7 +136,11 @@ def test_a_given_engine_and_the_calls_that_lose_a_link_are_named(tmp_path, exact
     method = {"name": "random", "options": {"budget": 12}}
     result = calibrate(planted.study(tmp_path, exact, method=method), engine=given)
     of_kind = {remark.kind: remark.values for remark in result.uncertainty.remarks}
-    assert of_kind[RemarkKind.GIVEN_ENGINE] == {"engine": engine.__name__, "used": "replay"}
+    described = {"engine": engine.__name__, "differentiable": False, "used": "replay"}
+    assert of_kind[RemarkKind.GIVEN_ENGINE] == described
+    assert f"engine {engine.__name__}" in str(result)
+    assert f"with the engine {engine.__name__}:" in " ".join(sentence.text for sentence in summary(result))
+    assert method_text(result, "auto") == "auto (vector surrogate)"
     infinite = int(np.isinf(result.history.rmse_db).sum())
     if engine is BlackBox:
         assert infinite == 0

@@ -22,7 +22,7 @@ from calibray.calibration.held_out_accuracy import (
 )
 from calibray.calibration.link_diagnostics import diagnose_links
 from calibray.calibration.result import Result
-from calibray.engines.protocol import PATH_LOSS, Engine
+from calibray.engines.protocol import PATH_LOSS, Differentiable, Engine
 from calibray.engines.replay import Replay
 from calibray.fitting.cheap_replay import CheapReplay
 from calibray.fitting.fidelity_loop import largest_gap
@@ -227,7 +227,11 @@ def given_engine_remark(setup: Setup, engine: Engine | None) -> tuple[Remark, ..
     """A remark if the user passed an engine of their own; predictions nevertheless use the engine of the study."""
     if engine is None or type(engine).__module__.partition(".")[0] == __name__.partition(".")[0]:
         return ()
-    values: dict[str, Value] = {"engine": type(engine).__name__, "used": setup.study.engine.name}
+    values: dict[str, Value] = {
+        "engine": type(engine).__name__,
+        "differentiable": isinstance(engine, Differentiable),
+        "used": setup.study.engine.name,
+    }
     return (Remark(RemarkKind.GIVEN_ENGINE, values),)
 
 

@@ -9,7 +9,7 @@ from statistics import stdev
 from typing import Final
 
 from calibray.parameters.parameter import PARAMETER_BOUNDS
-from calibray.reporting.wording import diagnostics_table, group_text, usable_link_text
+from calibray.reporting.wording import diagnostics_table, engine_text, group_text, usable_link_text
 from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
@@ -31,9 +31,7 @@ MARKS: Final[dict[str, str]] = {
 def heading(result: Record) -> str:
     """State the study, method, engine and seed of a calibration."""
     study = result.study
-    return (
-        f"{study.path.name}: method {study.method.name}, engine {study.engine.name}, seed {study.method.seed}"
-    )
+    return f"{study.path.name}: method {study.method.name}, engine {engine_text(result)}, seed {study.method.seed}"
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:

@@ -10,6 +10,7 @@ from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.reporting.wording import (
     block_sentence,
     carriers_text,
+    engine_text,
     group_text,
     method_text,
     prediction_text,
@@ -79,8 +80,8 @@ def _scope(result: Record) -> Sentence:
         "What was calibrated?",
         f"{counted(len(result.parameters), 'constant')} of {_list(materials)} at {carriers_text(result)}, on "
         f"{counted(result.counts['calibrated_on'], 'link')}, by {method_text(result, study.method.name)} with the "
-        f"engine {study.engine.name}: {counted(result.rt_calls, 'RT call')} in {_seconds(result.cost.seconds)}, after "
-        f"{_seconds(result.cost.trace_seconds)} of tracing and loading.",
+        f"engine {engine_text(result)}: {counted(result.rt_calls, 'RT call')} in {_seconds(result.cost.seconds)}, "
+        f"after {_seconds(result.cost.trace_seconds)} of tracing and loading.",
     )
 
 
@@ -120,7 +121,7 @@ def _certainty(result: Record) -> Iterator[Sentence]:
     if not result.intervals:
         yield Sentence(
             heading,
-            f"Unknown: the engine {result.study.engine.name} provides no derivatives, so there are no intervals. "
+            f"Unknown: the engine {engine_text(result)} provides no derivatives, so there are no intervals. "
             "The values fit best among those that were tried; the true values can be very different.",
             "caution",
         )

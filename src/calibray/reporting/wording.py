@@ -15,6 +15,7 @@ from calibray.optimizers import label
 from calibray.reporting.diagnostics import calibration_links, diagnostics, link_distance
 from calibray.result.held_out import HeldOutErrors, Model, ResidualField
 from calibray.result.record import Record
+from calibray.result.verdict import RemarkKind
 from calibray.study.calibration_sections import OFFSET
 from calibray.study.displacement import RECEIVER
 from calibray.support.messages import counted, percent
@@ -133,9 +134,23 @@ def scene_alone_text(record: Record) -> str:
     return f"The exported scene alone differs from the predictions by {rms}: a scene cannot contain {cause}.{near}"
 
 
+def _given_engine(record: Record) -> dict[str, Any] | None:
+    """The engine that a user passed to `calibrate`, as its remark describes it; None if the study's was called."""
+    remarks = record.uncertainty.remarks
+    return next((dict(remark.values) for remark in remarks if remark.kind is RemarkKind.GIVEN_ENGINE), None)
+
+
+def engine_text(record: Record) -> str:
+    """The name of the engine that a calibration called."""
+    given = _given_engine(record)
+    return record.study.engine.name if given is None else given["engine"]
+
+
 def method_text(record: Record, name: str) -> str:
     """The name of a calibration's method; for `auto` with an expensive engine, also the method that was used."""
-    if name != AUTO or not record.study.engine.expensive:
+    given = _given_engine(record)
+    expensive = record.study.engine.expensive if given is None else not given["differentiable"]
+    if name != AUTO or not expensive:
         return label(name)
     if record.study.engine.exports_rays:
         return f"{name} (ray mapping)"

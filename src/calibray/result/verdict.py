@@ -137,7 +137,7 @@ class RemarkKind(StrEnum):
     # with a path in one trace only
     RETRACED = "retraced"
     LOST_PATHS = "lost paths"  # calls, of (all), rows of the links without a path in these calls
-    GIVEN_ENGINE = "given engine"  # engine: its class; used, the name of the study's engine
+    GIVEN_ENGINE = "given engine"  # engine: its class; differentiable; used, the name of the study's engine
     NOT_JUDGED = "not judged"
     MISSING_REGION = "missing region"  # west, south, east, north, height, attenuation, links, share, chance
     # transmitters; azimuth_deg and downtilt_deg, the corrections of their stated angles, and azimuth_error_deg,
