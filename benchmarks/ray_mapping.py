@@ -304,12 +304,12 @@ def lowest(problem: Problem, foreign: Foreign, points: np.ndarray, random: np.ra
     return float(problem.objective.rmse(foreign.path_loss(candidates)).min())
 
 
-def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str, Any]:
+def repetition(place: Place, foreign: Foreign, name: str, seed: int, most_calls: int) -> dict[str, Any]:
     """One planted truth on one engine."""
     started, parameters = time.process_time(), foreign.parameters
     random = np.random.default_rng([seed, 30])
     problem, truth = planted(place, foreign, random)
-    mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
+    mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=most_calls)
     seconds = time.process_time() - started
     candidates = np.array([call.candidate for call in mapped.calls])
     optimum = lowest(problem, foreign, parameters.to_search(np.vstack([truth, candidates])), random)
@@ -324,13 +324,13 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int) -> dict[str
     }  # fmt: skip
 
 
-def _attempt(place: Place, name: str, seed: int) -> dict[str, Any] | None:
+def _attempt(place: Place, name: str, seed: int, most_calls: int) -> dict[str, Any] | None:
     """Run a repetition; a failed one counts as not solved and states the error. None if the engine has no path."""
     started = time.process_time()
     try:
         foreign = Foreign(place, name)
         if foreign.paths.num_paths:
-            return repetition(place, foreign, name, seed)
+            return repetition(place, foreign, name, seed, most_calls)
         print(f"{place.name}, {name} left out: no path", flush=True)
         return None
     except Exception as error:
@@ -355,6 +355,7 @@ def main() -> None:
         default=len(ENGINES),
         help="number of engines per truth, taken in turn from the list",
     )
+    parser.add_argument("--most-calls", type=int, default=6)
     parser.add_argument("--out", type=Path, help="file of the repetitions; an interrupted run continues")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no repetition after this time")
     options = parser.parse_args()
@@ -381,7 +382,7 @@ def main() -> None:
                     continue
                 if (place := made.get(make, number, name == "scattering")) is None:
                     continue
-                if (row := _attempt(place, name, seed)) is None:
+                if (row := _attempt(place, name, seed, options.most_calls)) is None:
                     continue
                 rows.append(row)
                 print(json.dumps(row), flush=True)
