@@ -26,7 +26,7 @@ from hypothesis import settings
 from calibray.cli import console
 from calibray.engines.replay import BATCH
 from calibray.fields import program as programs
-from calibray.fitting import search
+from calibray.fitting import cheap_replay, search
 from calibray.support import cache_folder as caching
 from calibray.uncertainty import buildings, richer_paths
 from calibray.uncertainty import sequential_monte_carlo as sampler
@@ -160,10 +160,11 @@ def _few_draws(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_further_paths(request: pytest.FixtureRequest) -> Iterator[None]:
-    """No check for paths that a study leaves out, which takes a trace, but in the tests of this check."""
+    """No trace for paths that a study leaves out, but in the tests of what such a trace is for."""
     with pytest.MonkeyPatch.context() as patch:
-        if request.path.stem != "test_richer_paths":
-            patch.setattr(richer_paths, "LONGEST_TRACE", 0.0)
+        for module in (cheap_replay, richer_paths):
+            if request.path.stem != f"test_{module.__name__.rpartition('.')[2]}":
+                patch.setattr(module, "LONGEST_TRACE", 0.0)
         yield
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.fitting.cheap_replay import DEEPER, further_layers
 from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.optimizers.sampling import design
@@ -112,6 +113,7 @@ class PlantedProblem:
         offsets: Whether every transmitter's measurements have an unknown offset.
         noise_db: Standard deviation of the noise [dB].
         truth: The planted candidate [d], in the fields' units.
+        further: Layers of paths that the simpler trace leaves out, by which the cheap model is extended.
     """
 
     kind: FamilyKind
@@ -126,6 +128,7 @@ class PlantedProblem:
     offsets: bool
     noise_db: float
     truth: NDArray[np.float64]
+    further: tuple[Paths, ...] = ()
 
     @property
     def lower(self) -> NDArray[np.float64]:
@@ -222,7 +225,7 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
     frequency = float(rng.choice(CARRIERS))
     differences = _differences(site, rng)
     truth = {name: _material(ranges, frequency, differences, rng) for name, ranges in site.materials.items()}
-    engine_paths, cheap_paths = _trace(site, truth, frequency, differences, rng)
+    engine_paths, cheap_paths, deeper_paths = _trace(site, truth, frequency, differences, rng)
     kept = _kept(engine_paths, cheap_paths)[:count]
     parameters = _parameters(truth, frequency, rng)
     planted = np.array([getattr(truth[item.material], item.field) for item in parameters])
@@ -244,6 +247,7 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
         offsets,
         noise,
         planted,
+        further_layers(take_links(deeper_paths, kept), differences.depth[1], False),
     )
 
 
@@ -318,8 +322,8 @@ def _trace(
     frequency: float,
     differences: Differences,
     rng: np.random.Generator,
-) -> tuple[Paths, Paths]:
-    """The paths of the engine and of the cheap model."""
+) -> tuple[Paths, Paths, Paths]:
+    """The paths of the engine, of the cheap model, and of a trace with which the cheap model is extended."""
     believed = _believed(site, truth, differences, rng)
     moved = _Links(*(_displaced(ends, differences.position_error, rng) for ends in (site.tx, site.rx)))
     dipole, simple = Antenna("dipole", "V"), Antenna("iso" if differences.antennas else "dipole", "V")
@@ -341,7 +345,10 @@ def _trace(
             path = np.repeat(np.arange(mixed.num_paths), np.diff(mixed.first))
             diffuse = np.unique(path[mixed.kind == InteractionKind.DIFFUSE])
             engine_paths = concatenate([engine_paths, take(mixed, diffuse)])
-        return engine_paths, _paths(scene, believed, _Links(site.tx, site.rx), frequency, cheap, simple)
+        return engine_paths, *(
+            _paths(scene, believed, _Links(site.tx, site.rx), frequency, settings, simple)
+            for settings in (cheap, replace(cheap, max_depth=cheap.max_depth + DEEPER, diffraction=True))
+        )
 
 
 @dataclass(frozen=True)

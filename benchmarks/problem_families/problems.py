@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from calibray.comparison.method_runs import ComparisonProblem
 from calibray.engines import Replay
-from calibray.fitting.cheap_replay import ReplayedModel, with_constants
+from calibray.fitting.cheap_replay import ReplayedModel, with_constants, with_layers
 from calibray.fitting.problem import Evaluation
 from calibray.measurements.observables import Statistic
 from problem_families import landscapes
 from problem_families.family import PlantedProblem, problem
+from problem_families.numpy_replay import NumpyReplay
 
 
 def landscape_problem(name: str) -> ComparisonProblem:
@@ -59,7 +60,8 @@ def planted_problem(kind: str, seed: int) -> ComparisonProblem:
     middle = planted.parameters.from_search(0.5 * (planted.lower + planted.upper)[None])
     constants = with_constants(planted.parameters, planted.cheap.paths.materials)
     digest = hashlib.sha256(planted.fingerprint.encode())
-    for part in (planted.cheap.path_loss(middle), *constants.search_bounds):
+    further = [NumpyReplay(part, planted.parameters).path_loss(middle) for part in planted.further]
+    for part in (planted.cheap.path_loss(middle), *further, *constants.search_bounds):
         digest.update(np.round(part, 6).astype("<f8").tobytes())
     return ComparisonProblem(
         f"{kind}-{seed}",
@@ -120,11 +122,13 @@ class PlantedRows:
 
 def cheap_model(planted: PlantedProblem) -> ReplayedModel:
     """The cheap model of a planted problem, with its nominal constants."""
-    return ReplayedModel(_compiled(planted), len(planted.parameters), PlantedRows(planted))
+    rows = PlantedRows(planted)
+    return ReplayedModel(_compiled(planted), len(planted.parameters), rows, len(planted.further))
 
 
 @lru_cache(maxsize=1)
 def _compiled(planted: PlantedProblem) -> Replay:
     """The replay of a cheap model, compiled once for all runs of a problem."""
     paths = planted.cheap.paths
-    return Replay(paths, with_constants(planted.parameters, paths.materials))
+    parameters = with_constants(planted.parameters, paths.materials)
+    return Replay(with_layers(paths, planted.further), parameters)

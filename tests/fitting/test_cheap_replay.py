@@ -14,14 +14,21 @@ import programs
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, make_cheap_replay, with_constants
+from calibray.fitting.cheap_replay import (
+    DEEPER,
+    ProblemRows,
+    ReplayedModel,
+    further_layers,
+    make_cheap_replay,
+    with_constants,
+)
 from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import choose, rounds
 from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter, Parameters
-from calibray.paths import take
+from calibray.paths import Kind, Paths, take
 from calibray.reporting.result_tables import costs
 from calibray.study import Setup, Study
 from calibray.tables import render
@@ -100,6 +107,70 @@ def test_derivatives_of_the_cheap_model_agree_with_its_residuals(asked, model):
         )
         slope = told.by_point[0, :, k] if k < 3 else told.by_constant[0, :, k - 3]
         assert slope == pytest.approx((there - here)[0] / 2e-5, rel=1e-3, abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def richer(asked) -> Paths:
+    """The paths with up to two more interactions than the study allows, and with diffraction."""
+    trace = asked.setup.study.trace
+    return asked.setup.with_trace(
+        replace(trace, max_depth=trace.max_depth + DEEPER, diffraction=True)
+    ).trace()
+
+
+def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, richer):
+    paths, trace = asked.setup.trace(), asked.setup.study.trace
+    layers = further_layers(richer, trace.max_depth, trace.diffraction)
+    assert len(layers) == 3
+    assert paths.num_paths + sum(layer.num_paths for layer in layers) == richer.num_paths
+    deeper, deepest, diffracted = layers
+    assert set(np.diff(deeper.first)) == {trace.max_depth + 1}
+    assert set(np.diff(deepest.first)) == {trace.max_depth + 2}
+    assert (np.add.reduceat(diffracted.kind == Kind.DIFFRACTION, diffracted.first[:-1]) == 1).all()
+    assert not (deeper.kind == Kind.DIFFRACTION).any()
+    assert len(further_layers(richer, trace.max_depth, True)) == 2
+    assert further_layers(paths, trace.max_depth, False) == ()
+
+
+def test_gains_scale_the_power_of_the_layers(asked, model, richer):
+    parameters = with_constants(asked.parameters, richer.materials)
+    point = asked.parameters.to_search(asked.parameters.start)[None]
+    constants = model.constants.centre[: len(parameters) - 3]
+    candidate = parameters.from_search(np.hstack([point, constants[None]]))
+    all_paths, study_paths = (
+        asked.residuals(candidate[:, :3], Replay(paths, parameters).path_loss(candidate))
+        for paths in (richer, asked.setup.trace())
+    )
+    for log_gain, expected in ((0.0, all_paths), (-40.0, study_paths)):
+        gains = np.full(model.layers, log_gain)
+        # Weak paths are left out of the layers.
+        assert model.residuals(point, np.hstack([constants, gains])[None]) == pytest.approx(
+            expected, abs=0.01
+        )
+    assert np.abs(all_paths - study_paths).max() > 0.05
+
+
+class Richer(Calls):
+    """An engine without derivatives that finds more paths than the study's settings."""
+
+    def __init__(self, paths: Paths, parameters: Parameters) -> None:
+        super().__init__()
+        self.replay = Replay(paths, parameters)
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        return self.replay.path_loss(candidates)
+
+
+def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(asked, model, richer):
+    gain = []
+    for paths in (richer, asked.setup.trace()):
+        engine = replace(asked, engine=Richer(paths, asked.parameters))
+        optimizer = choose(engine, model)
+        for _ in islice(rounds(optimizer, engine.evaluate), 5):
+            pass
+        gain.append(np.exp(optimizer.corrected.constants[-model.layers :]))
+    assert gain[0].max() > 0.5
+    assert gain[1].max() < 0.1
 
 
 def test_links_that_only_the_engine_reaches_are_unknown_to_the_model(asked):

@@ -1,6 +1,8 @@
 """A replay of the study's scene, used as a cheap model of an engine without derivatives.
 
-We trace the study's scene once. Evaluating a candidate on the stored paths then takes microseconds. The constants of
+We trace the study's scene once. Evaluating a candidate on the stored paths then takes microseconds. The engine may
+find paths that the study's settings leave out. We therefore trace the scene once more, with more interactions and with
+diffraction. These further paths form layers. The power of a layer is multiplied by an unknown gain. The constants of
 the cheap model are the material constants that the study does not calibrate: thickness, conductivity and permittivity,
 in order of importance. Space mapping adjusts these constants.
 """
@@ -8,6 +10,7 @@ in order of importance. Space mapping adjusts these constants.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol, cast, final
 
@@ -16,6 +19,8 @@ from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import replay
 from calibray.engines.protocol import PATH_LOSS, Observing, Responses
+from calibray.engines.rays.compile import powers
+from calibray.engines.replay import Replay
 from calibray.errors import EngineError, InputError
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import AUTO
@@ -24,6 +29,7 @@ from calibray.measurements.observables import Statistic
 from calibray.optimizers.protocol import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
 from calibray.parameters.parameter import PARAMETER_BOUNDS
+from calibray.paths import Kind, Paths, join_links, take
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
 from calibray.support.progress import Progress
@@ -33,6 +39,18 @@ SPREAD: Final = {"thickness": 0.5, "conductivity": 0.7, "relative_permittivity":
 
 BOUND: Final = 3.0
 """Distance from a constant's declared value to its bounds, in standard deviations."""
+
+GAIN: Final = (-1.2, 1.2)
+"""Mean and standard deviation of the logarithm of a layer's gain, by which the power of its paths is multiplied."""
+
+DEEPER: Final = 2
+"""Number of interactions that further paths may have in addition to those that the study allows."""
+
+LONGEST_TRACE: Final = 60.0
+"""Estimated duration of a trace above which no further paths are traced [s]."""
+
+WEAK: Final = 1e-2
+"""Share of a link's power below which a further path is left out."""
 
 METAL: Final = 1e4
 """Conductivity [S/m] above which a material reflects almost all power, regardless of its other constants."""
@@ -97,9 +115,11 @@ class ReplayedModel:
     """A replay used as a cheap model; its constants are those that the study does not calibrate.
 
     Attributes:
-        engine: The replay; its parameters are those of the study, followed by the constants.
+        engine: The replay; its parameters are those of the study, followed by the material constants. Its links are
+            the study's L links, repeated for each layer of further paths [(1 + layers) L].
         count: Number of the study's parameters.
         rows: Converts path loss to residuals.
+        layers: Number of layers of further paths; the gain of each layer is one more constant.
         calls: Number of candidates evaluated so far.
         seconds: Time taken by their evaluation [s].
     """
@@ -107,6 +127,7 @@ class ReplayedModel:
     engine: StoredPaths
     count: int
     rows: Rows
+    layers: int = 0
     calls: int = 0
     seconds: float = 0.0
     _reached: NDArray[np.bool_] = field(init=False)
@@ -114,7 +135,8 @@ class ReplayedModel:
     def __post_init__(self) -> None:
         start = self.engine.parameters.start
         # All candidates share the stored paths, so a link without a path here has no path for any candidate.
-        self._reached = np.isfinite(self.engine.path_loss(start[None])[0])
+        loss = self.engine.path_loss(start[None]).reshape(1 + self.layers, -1)
+        self._reached = np.isfinite(loss).any(axis=0)
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -128,12 +150,18 @@ class ReplayedModel:
         lower, upper = (bound[self.count :] for bound in parameters.search_bounds)
         # The bounds are `BOUND` standard deviations from the centre, in logarithms.
         centre = parameters.to_search(parameters.start)[self.count :]
-        return Constants(centre, (upper - lower) / (2.0 * BOUND), lower, upper)
+        mean, spread = (np.full(self.layers, value) for value in GAIN)
+        return Constants(
+            np.hstack([centre, mean]),
+            np.hstack([(upper - lower) / (2.0 * BOUND), spread]),
+            np.hstack([lower, mean - BOUND * spread]),
+            np.hstack([upper, mean + BOUND * spread]),
+        )
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `CheapModel.residuals`."""
         started, candidates = time.perf_counter(), self._candidates(points, constants)
-        answer = self._respond(candidates, False)
+        answer = self._respond(candidates, constants[:, constants.shape[1] - self.layers :], False)
         self._count(started, len(points))
         loss = self._filled(answer.path_loss)
         return self.rows.residuals(candidates[:, : self.count], loss, answer.observed)
@@ -141,9 +169,11 @@ class ReplayedModel:
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
         """See `CheapModel.answer`."""
         started, candidates = time.perf_counter(), self._candidates(points, constants)
-        answer = self._respond(candidates, True)
+        answer = self._respond(candidates, constants[:, constants.shape[1] - self.layers :], True)
         self._count(started, len(points))
         unit = self.engine.parameters.search_slope(candidates)
+        # Gains are logarithms in the search space and in the answer.
+        unit = np.hstack([unit, np.ones((len(unit), self.layers))])
         slope, observed_slope = cast(NDArray, answer.loss_slope), answer.observed_slope
         slope = np.where(np.isfinite(slope) & np.isfinite(answer.path_loss)[:, :, None], slope, 0.0)
         if observed_slope is not None:
@@ -156,17 +186,38 @@ class ReplayedModel:
             slopes[:, :, self.count :],
         )
 
-    def _respond(self, candidates: NDArray[np.float64], derivatives: bool) -> Responses:
+    def _respond(
+        self, candidates: NDArray[np.float64], log_gain: NDArray[np.float64], derivatives: bool
+    ) -> Responses:
+        """Responses to candidates [n, d], with the logarithms of the gains [n, layers]; derivatives include these."""
         if self.rows.wanted:
             return cast(Observing, self.engine).respond(candidates, self.rows.wanted, derivatives)
         none = np.zeros((len(candidates), 0, len(self._reached)))
         if not derivatives:
-            return Responses(self.engine.path_loss(candidates), none)
+            return Responses(self._total(self.engine.path_loss(candidates), log_gain)[0], none)
         loss, slope = self.engine.path_loss_and_jacobian(candidates)
-        return Responses(loss, none, slope)
+        total, share = self._total(loss, log_gain)
+        slope = slope.reshape(*share.shape, -1)
+        by_parameter = np.sum(share[..., None] * np.where(share[..., None] > 0, slope, 0.0), axis=1)
+        by_gain = -10.0 / np.log(10.0) * np.moveaxis(share[:, 1:], 1, 2)
+        return Responses(total, none, np.concatenate([by_parameter, by_gain], axis=2))
+
+    def _total(
+        self, loss: NDArray[np.float64], log_gain: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Path loss of all layers together [n, L], [dB], and the share of each layer in the power [n, 1 + layers, L].
+
+        `loss` is the path loss of the study's paths and of each layer [n, (1 + layers) L].
+        """
+        power = 10.0 ** (-loss.reshape(len(loss), 1 + self.layers, -1) / 10.0)
+        power[:, 1:] *= np.exp(log_gain)[:, :, None]
+        total = power.sum(axis=1)
+        with np.errstate(divide="ignore"):
+            return -10.0 * np.log10(total), power / np.maximum(total, np.finfo(float).tiny)[:, None]
 
     def _candidates(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self.engine.parameters.from_search(np.hstack([points, constants]))
+        material = constants[:, : constants.shape[1] - self.layers]
+        return self.engine.parameters.from_search(np.hstack([points, material]))
 
     def _filled(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(self._reached, loss, self.rows.filling)
@@ -254,14 +305,57 @@ def make_cheap_replay(
         scene = setup if scene is None else scene
         paths = scene.trace(progress=progress)
         parameters = with_constants(problem.parameters, paths.materials, setup.links.frequency is None)
-        engine = replay(replace(scene, parameters=parameters), paths)
-        model = ReplayedModel(engine, len(problem.parameters), ProblemRows(problem))
+        scene = replace(scene, parameters=parameters)
+        layers = _further_paths(problem, scene, paths, progress)
+        engine = Replay(with_layers(paths, layers), parameters) if layers else replay(scene, paths)
+        model = ReplayedModel(engine, len(problem.parameters), ProblemRows(problem), len(layers))
     except (InputError, EngineError, ImportError) as error:
         reason = " ".join(str(error).split())
         return CheapReplay(None, _no_model(f"the scene cannot be traced here ({reason})"))
     if not model.known.any():
         return CheapReplay(None, _no_model("no link has a path in the traced scene"))
     return CheapReplay(model)
+
+
+def _further_paths(
+    problem: Problem, scene: Setup, paths: Paths, progress: Progress | None
+) -> tuple[Paths, ...]:
+    """Layers of paths that the study's trace leaves out; none if path loss is not the sum of the powers of paths."""
+    study, trace = scene.study, scene.study.trace
+    one_carrier = scene.links.frequency is None and not scene.parameters.has_laws
+    summed = study.objective.combining == "power" and one_carrier and not scene.effects(paths)
+    if not summed or problem.statistics or study.rays_path is not None or study.engine.exports_rays:
+        return ()
+    richer = scene.with_trace(replace(trace, max_depth=trace.max_depth + DEEPER, diffraction=True))
+    if richer.tracer.plan(richer.links).seconds > LONGEST_TRACE:
+        return ()
+    try:
+        further = richer.trace(progress=progress)
+    except (InputError, EngineError):  # for example too many paths
+        return ()
+    return further_layers(further, trace.max_depth, trace.diffraction)
+
+
+def further_layers(paths: Paths, max_depth: int, diffraction: bool) -> tuple[Paths, ...]:
+    """The paths that a trace of at most `max_depth` interactions, with or without diffraction, leaves out.
+
+    There are up to three layers: paths with one interaction more, paths with more than one interaction more, and paths
+    with a diffraction if the trace finds none. Weak paths are left out, as are layers without paths.
+    """
+    interactions, power = np.diff(paths.first), powers(paths)
+    strong = power >= WEAK * np.bincount(paths.link, power, paths.num_links)[paths.link]
+    diffracted = np.zeros(paths.num_paths, dtype=bool)
+    if not diffraction:
+        diffracted[np.repeat(np.arange(paths.num_paths), interactions)[paths.kind == Kind.DIFFRACTION]] = True
+    more = np.where(diffracted, 0, interactions - max_depth)
+    masks = (strong & (more == 1), strong & (more > 1), strong & diffracted)
+    return tuple(take(paths, mask) for mask in masks if mask.any())
+
+
+def with_layers(paths: Paths, layers: Sequence[Paths]) -> Paths:
+    """The paths and the layers of further paths as one program; its links are repeated for each layer."""
+    links = np.arange(paths.num_links)
+    return join_links([(links + k * len(links), part) for k, part in enumerate((paths, *layers))])
 
 
 def _no_model(cause: str) -> Remark:

@@ -274,7 +274,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
     calls = _calls(problem, trail, box, rows)
     random, noisy = np.random.default_rng([method.seed, 8]), bool(method.options.get("noisy", False))
     # Use the replay with the emulated rows as its residuals, if it predicts any of these rows.
-    replayed = None if model is None else ReplayedModel(model.engine, model.count, rows)
+    replayed = None if model is None else ReplayedModel(model.engine, model.count, rows, model.layers)
     replayed = replayed if replayed is not None and replayed.known.any() else None
     corrected = None
     if replayed is not None and len(calls.unit) > 1:
