@@ -32,7 +32,7 @@ from calibray.parameters.parameter import PARAMETER_BOUNDS
 from calibray.paths import Kind, Paths, join_links, take
 from calibray.result.verdict import Remark, RemarkKind
 from calibray.study import Setup
-from calibray.support.progress import Progress
+from calibray.support.progress import Progress, with_stage
 
 SPREAD: Final = {"thickness": 0.5, "conductivity": 0.7, "relative_permittivity": 0.2}
 """Standard deviation of the logarithm of a constant around its declared value."""
@@ -292,8 +292,8 @@ def make_cheap_replay(
 ) -> CheapReplay:
     """Trace a problem's scene for a cheap model if the method uses such a model; if tracing fails, report the reason.
 
-    If `scene`, another study of the same links, is given, its scene is traced instead. The stage of `progress` is
-    "tracing".
+    If `scene`, another study of the same links, is given, its scene is traced instead. The stages of `progress` are
+    "tracing" and "tracing more paths".
     """
     setup = problem.setup
     section = setup.study.method
@@ -326,12 +326,12 @@ def _further_paths(
     summed = study.objective.combining == "power" and one_carrier and not scene.effects(paths)
     if not summed or problem.statistics or study.rays_path is not None or study.engine.exports_rays:
         return ()
-    richer = scene.with_trace(replace(trace, max_depth=trace.max_depth + DEEPER, diffraction=True))
-    if richer.tracer.plan(richer.links).seconds > LONGEST_TRACE:
-        return ()
     try:
-        further = richer.trace(progress=progress)
-    except (InputError, EngineError):  # for example too many paths
+        richer = scene.with_trace(replace(trace, max_depth=trace.max_depth + DEEPER, diffraction=True))
+        if richer.tracer.plan(richer.links).seconds > LONGEST_TRACE:
+            return ()
+        further = richer.trace(progress=with_stage(progress, "tracing more paths"))
+    except (InputError, EngineError):  # for example too many paths; the study's own paths are sufficient
         return ()
     return further_layers(further, trace.max_depth, trace.diffraction)
 
