@@ -108,7 +108,7 @@ def calibray(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    """Calibrate the radio materials of a ray-traced scene with measured path loss."""
+    """Calibrate the radio materials of a ray-traced scene against measured path loss."""
 
 
 for command in (  # in the order of `--help`

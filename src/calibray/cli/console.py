@@ -62,7 +62,7 @@ def print_costs() -> None:
 
 
 def option(placeholder: str, meaning: str, *names: str, **limits: Any) -> Any:
-    """An option that takes a value; `names` is needed only if the option and the argument have different names."""
+    """An option that takes a value; `names` is needed only if its name differs from that of the Python argument."""
     return typer.Option(*names, metavar=placeholder, help=meaning, **limits)
 
 

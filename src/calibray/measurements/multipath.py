@@ -346,7 +346,7 @@ def _above_noise(
 
 
 def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """Read the array of responses in a file and the delays of its samples [s]."""
+    """Read the impulse responses from a file, and the delays of their samples [s]."""
     with _explained(file):
         arrays = _arrays(file)
     delays = next((arrays.pop(name) for name in list(arrays) if name.lower() in DELAYS), None)

@@ -38,7 +38,7 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Error that ends a minimiser whose search was dropped; a library might catch an error derived from `Exception`."""
+    """Ends a minimiser whose search was dropped; a `BaseException`, because a library might catch an `Exception`."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:

@@ -127,7 +127,10 @@ class Session:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """Stop a search at the budget, and shorten the last batch if necessary. The search itself must not end earlier."""
+    """Stop a search when its budget is used up, and shorten the last batch if necessary.
+
+    The search itself must not end earlier.
+    """
     with closing(search):
         x = next(search)
         while True:

@@ -78,7 +78,7 @@ class Plan:
 
 
 def plan(survey: Survey, triangles: Triangles | None, regions: Iterable[Region] = ()) -> Plan:
-    """Lay out the map of a calibration's links, with regions such as trees and, if it can be read, with the scene."""
+    """Lay out the map of a calibration's links, including regions (such as trees) and, if it can be read, the scene."""
     layout = lay_out(np.concatenate([survey.tx, survey.rx]), triangles)
     return replace(layout, regions="".join(_outlines(region, layout) for region in regions))
 

@@ -264,7 +264,7 @@ def _polar_figures(
 
 
 def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gain of a link's antenna on the horizon, relative to the maximum gain on the horizon [n], [dB]."""
+    """Gain of a link's antenna in the horizontal plane at the given bearings, relative to the maximum [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
     # Azimuths on the horizon are measured anticlockwise from east, and bearings clockwise from north.

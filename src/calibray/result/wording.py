@@ -181,7 +181,7 @@ _CAUSES: Final = {
     "correlated": "neighbouring links have less weight than independent links if they share part of their errors",
     "out_of_sight": "weak links out of sight have less weight if paths to these links are missing",
     "student-t": "outliers have less weight if the noise has heavy tails",
-    "heterogeneous": "links that depend on single buildings have less weight if buildings differ",
+    "heterogeneous": "links that depend on a single building have less weight if the constants of buildings differ",
     "gaussian": "the noise model of the intervals differs from that of the RMSE",
 }
 

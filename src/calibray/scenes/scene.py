@@ -430,7 +430,7 @@ def export_scene(
 
 
 def exported_names(names: Iterable[str]) -> dict[str, str]:
-    """Choose unique material names of letters, digits, `_` and `-` for an exported scene.
+    """Choose unique material names, made up of letters, digits, `_` and `-`, for an exported scene.
 
     Sionna RT refuses a plain `radio-material` with an ITU name, so an ITU name becomes `calibrated-NAME`. Mitsuba
     misreads names with dots, quotes or line breaks.

@@ -163,7 +163,7 @@ class MountingSection(Section):
         electrical_downtilt_deg: Downward tilt [deg] of the pattern or, for an array, of the beam, in the frame of the
             antenna; a number or a column.
         steering_deg: Azimuth [deg] to which the beam of an array is steered electrically, relative to the antenna; a
-            number or a column. This azimuth is clockwise if azimuths are compass bearings.
+            number or a column. This azimuth is measured clockwise if azimuths are compass bearings.
         aim: "other end" points every antenna at the other end of its link and replaces azimuth and downtilt.
     """
 

@@ -53,8 +53,8 @@ STRONGEST: Final = 0.05
 def excess_db(problem: Problem) -> NDArray[np.float64]:
     """Excess over free-space loss of links out of sight, relative to the excess of the strongest links [L], [dB].
 
-    The excess is the median over candidates within the bounds. The excess is minus infinity for links in sight, which
-    have a direct path, and for links without a path.
+    The excess is the median over candidates within the bounds. It is minus infinity for line-of-sight links and for
+    links without a path.
     """
     from scipy.stats import qmc  # takes 0.4 s
 

@@ -34,7 +34,7 @@ from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, H
 
 SIGNIFICANT: Final = 0.005
 """A conflict is reported if its p-value, the probability of a larger increase without a conflict, is below this value.
-Errors shared by neighbouring links make small probabilities slightly more frequent."""
+Errors shared by neighbouring links make small p-values slightly more common."""
 
 UNRELATED: Final = 0.02
 """An observable is reported as not fitting the scene if the probability of a slope this small under the model is below

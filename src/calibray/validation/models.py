@@ -1,6 +1,7 @@
 """The models that validation compares: baselines without paths, and variants of the study's model that use the scene.
 
-The baselines are the log-distance model, the log-distance model with obstruction of the direct line, and kriging.
+The baselines are the log-distance model, the log-distance model with terms for obstruction of the line of sight, and
+kriging.
 
 The variants are the study's own model, the initial materials, the model with a prior around the initial values, and the
 model with this prior and with offsets per transmitter and for links out of sight. An engineer would try these models by

@@ -243,9 +243,8 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
     for name in np.unique(table.material[table.material != ""]).tolist():
         if name not in names:
             raise InputError(
-                f"{table.source}: material: the scene has no material {name!r}; {did_you_mean(name, names)}. Use "
-                "the names of the scene's materials, or remove the column material; each interaction then has the "
-                "material of the nearest face"
+                f"{table.source}: the scene has no material {name!r}; without the column material, each interaction "
+                f"has the material of the nearest face; {did_you_mean(name, names)}"
             )
         stated = table.material == name
         if (stated & (index >= 0) & (index != names[name])).any():

@@ -281,7 +281,7 @@ class SpaceMapping(Optimizer):
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """Resize the trust region after an exploitation, and explore once if the improvement was too small."""
+        """Resize the trust region after an exploitation step, and explore next if the improvement was too small."""
         # The last step was an exploration, or no evaluation before the last step succeeded.
         if self._stalled or not np.isfinite(before):
             self._stalled = False

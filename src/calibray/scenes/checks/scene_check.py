@@ -370,7 +370,7 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sign [F], +1 or -1, that gives each face the orientation of its neighbours, and index of its piece [F]."""
+    """Sign [F], +1 or -1, that orients each face consistently with its neighbours, and index of its component [F]."""
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")

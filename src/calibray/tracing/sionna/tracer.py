@@ -236,7 +236,7 @@ class Tracer:
 
     @unwrap_interruption()
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n].
+        """Whether each point [n, 3], [m], lies inside a closed body of the scene, for example a building; shape [n].
 
         A ray from inside a closed body crosses its surface an odd number of times. Because surfaces can have gaps, rays
         are sent in several directions, and the majority decides. All rays point upwards, because buildings often lack a
