@@ -109,7 +109,7 @@ class Track:
         file: The GPX file.
         time: Column with the times of the rows.
         longest_gap: Longest time between two track points [s]; rows in longer gaps are left out.
-        clock: Time by which the clock of the rows is ahead of the clock of the track [s].
+        clock: Time by which the logger's clock is ahead of the clock of the track [s].
     """
 
     file: str

@@ -112,7 +112,7 @@ def nuisance_shift(
     A group without a coefficient is assigned the mean of the n coefficients. For such a group, the standard deviation s
     between groups is enlarged by the uncertainty of the mean, to s sqrt(1 + 1 / n). With `new_groups`, groups without a
     coefficient are also allowed in terms without an estimated spread. New transmitters are always allowed, because no
-    column identifies transmitters. `draws` contains posterior draws by the name of the coefficient.
+    column identifies transmitters. `draws` contains posterior draws, keyed by coefficient name.
 
     Raises:
         InputError: A group has no coefficient although `new_groups` is False.

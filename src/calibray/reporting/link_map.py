@@ -155,7 +155,7 @@ def ramp_limit(value: NDArray[np.float64]) -> float:
 
 
 def _round(value: float, up: bool = False) -> float:
-    """The largest number of the series 1, 2, 5, 10, ... not above a value or, with `up`, the smallest not below it."""
+    """The largest number in the series 1, 2, 5, 10, ... not above a value or, with `up`, the smallest not below it."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
     # A rounding error above a step must not lead to the next step.

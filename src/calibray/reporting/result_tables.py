@@ -218,7 +218,7 @@ def costs(result: Record) -> Table:
 
 @dataclass(frozen=True)
 class Value:
-    """A parameter as shown in the report, with texts, and with positions on a bar between the parameter's bounds.
+    """A parameter as shown in the report: its texts, and positions on a bar that spans the parameter's bounds.
 
     Attributes:
         name: Name of the parameter.

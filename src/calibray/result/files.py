@@ -398,7 +398,7 @@ def _problem_digest(study: Study) -> str:
 
 
 def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool:
-    """Whether two arrays of measured path loss [links], [dB], agree within the rounding of values in files."""
+    """Whether two arrays [links] of measured path loss [dB] agree to within the rounding of values in files."""
     return len(first_db) == len(second_db) and bool(np.abs(first_db - second_db).max() <= 1e-3)
 
 

@@ -201,8 +201,8 @@ def _outside_interval(values: dict[str, Any]) -> str:
     if odds < CLEAR_ODDS:
         text = (
             f"The candidate with the lowest RMSE is outside an interval: {'; '.join(low for low, _ in parameters)}. No "
-            "other candidate is clearly more probable. However, few candidates near this one fit equally well, and "
-            "most candidates that fit equally well are inside the intervals."
+            "other candidate is clearly more probable. Of the candidates that fit equally well, only a few are near "
+            "this one; most are inside the intervals."
         )
     else:
         times = f"more than {MOST_ODDS:,.0f}" if odds >= 0.999 * MOST_ODDS else f"{odds:.2g}"

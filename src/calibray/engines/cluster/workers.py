@@ -126,7 +126,7 @@ class InProcess:
 
 @dataclass(eq=False)
 class _KeptHere:
-    """Objects that are made on first use and kept as long as memory suffices."""
+    """Objects that are made on first use and kept as long as memory allows."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
