@@ -49,7 +49,7 @@ DEEPER: Final = 2
 LONGEST_TRACE: Final = 60.0
 """Estimated duration of a trace above which no further paths are traced [s]."""
 
-WEAK: Final = 1e-2
+WEAK: Final = 3e-3
 """Share of a link's power below which a further path is left out."""
 
 METAL: Final = 1e4
