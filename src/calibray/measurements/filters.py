@@ -37,8 +37,8 @@ MAX_PATTERN_LENGTH: Final = 200
 """Maximum number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Maximum sum of the squared lengths of the texts in a column that a pattern with a repetition may search. At this
-limit, a search takes 2 to 5 s."""
+"""Limit for searching a column with a pattern that contains a repetition: the maximum sum, over the column's texts, of
+the squared length. At this limit, a search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 

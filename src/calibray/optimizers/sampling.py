@@ -18,7 +18,7 @@ from calibray.support.interruption import defer_interruption
 
 
 def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw points of the unit cube [count, dimension].
+    """Draw points in the unit cube [count, dimension].
 
     The kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of `count` slices of every
     dimension) and "sobol" (the first `count` points of a scrambled sequence whose length is the next power of two).

@@ -199,7 +199,7 @@ def krige_residuals(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Krige the residual field from measured links to new links; positions are those of both ends [m, 6], [n, 6], [m].
 
-    A residual is the measured minus the modelled path loss [m], [dB]. The results are the correction of the modelled
+    `residuals` [m] are the measured minus the modelled path loss [dB]. The results are the correction of the modelled
     path loss [n], [dB], and the share of the field's variance that the measured links explain [n]. This share is 0 far
     from all measured links, and less than 1 near a measured link.
     """

@@ -202,7 +202,7 @@ class _Splitting:
         )
 
     def split_chunks(self, engine: Chunked) -> SplitChunks:
-        """Split the replays of chunks on their workers."""
+        """Split the replays of all chunks; each worker splits its own chunks."""
         answers = engine.ask(_split_chunk, self)
         constants = np.unique(np.concatenate([key for key, _, _ in answers]), axis=0)
         met = np.unique(np.concatenate([numbers for _, numbers, _ in answers]))

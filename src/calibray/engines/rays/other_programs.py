@@ -232,7 +232,7 @@ def _insite_numbers(file: Path, line: tuple[int, str], *counts: int) -> list[flo
 
 AODT_FILES: Final = ("raypaths.parquet", "cirs.parquet")
 AODT_UNIT: Final = 0.01
-"""Unit of lengths in an export [m]."""
+"""Unit of length in an export [m]."""
 
 AODT_PAIR: Final = ["ru_id", "ue_id"]
 AODT_ELEMENT: Final = "ru_ant_el"
