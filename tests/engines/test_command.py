@@ -414,7 +414,7 @@ def test_executors_that_are_refused(workers, scheduler, message, monkeypatch):
 def test_retrace_takes_no_workers(tmp_path):
     with (
         engines.open_workers(1) as workers,
-        pytest.raises(InputError, match="need the engine 'command' or 'replay'"),
+        pytest.raises(InputError, match="require the engine 'command' or 'replay'"),
     ):
         engines.make(programs.study(tmp_path), "retrace", workers=workers)
 

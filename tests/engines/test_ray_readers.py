@@ -323,7 +323,7 @@ REFUSED = {
         write_insite,
         lambda file: file.write_text(file.read_text()[:-60]),
         {"tx_power_dbm": 13.0},
-        "ends within a path|must be",
+        "ends within a path|must contain",
     ),
     "a missing file": (write_insite, Path.unlink, {"tx_power_dbm": 13.0}, "no such file"),
     "foliage": (

@@ -158,7 +158,7 @@ WRONG = {
     "an unknown type": (lambda t: t.replace({"type": {"reflection": "R"}}), "'R'"),
     "an unknown material": (
         lambda t: t.assign(material="wood"),
-        "no material 'wood'.* or remove the column material",
+        "no material 'wood'.* without the column material",
     ),
     "two powers of a path": (
         lambda t: t.assign(power_db=t.power_db - t.point),

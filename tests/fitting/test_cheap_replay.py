@@ -13,7 +13,9 @@ import planted
 import programs
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
+from calibray.engines.rays.compile import powers
 from calibray.errors import InputError
+from calibray.fitting import cheap_replay
 from calibray.fitting.cheap_replay import (
     DEEPER,
     ProblemRows,
@@ -21,6 +23,7 @@ from calibray.fitting.cheap_replay import (
     further_layers,
     make_cheap_replay,
     with_constants,
+    with_layers,
 )
 from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.problem import Problem
@@ -118,35 +121,52 @@ def richer(asked) -> Paths:
     ).trace()
 
 
-def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, richer):
-    paths, trace = asked.setup.trace(), asked.setup.study.trace
-    layers = further_layers(richer, trace.max_depth, trace.diffraction)
+@pytest.fixture
+def layers(asked, richer, monkeypatch) -> tuple[Paths, ...]:
+    """All paths that the study leaves out, weak ones too."""
+    trace = asked.setup.study.trace
+    monkeypatch.setattr(cheap_replay, "WEAK", 0.0)
+    return further_layers(richer, trace.max_depth, trace.diffraction)
+
+
+def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, richer, layers):
+    paths, depth = asked.setup.trace(), asked.setup.study.trace.max_depth
     assert len(layers) == 3
     assert paths.num_paths + sum(layer.num_paths for layer in layers) == richer.num_paths
     deeper, deepest, diffracted = layers
-    assert set(np.diff(deeper.first)) == {trace.max_depth + 1}
-    assert set(np.diff(deepest.first)) == {trace.max_depth + 2}
+    assert set(np.diff(deeper.first)) == {depth + 1}
+    assert set(np.diff(deepest.first)) == {depth + 2}
     assert (np.add.reduceat(diffracted.kind == Kind.DIFFRACTION, diffracted.first[:-1]) == 1).all()
     assert not (deeper.kind == Kind.DIFFRACTION).any()
-    assert len(further_layers(richer, trace.max_depth, True)) == 2
-    assert further_layers(paths, trace.max_depth, False) == ()
+    assert len(further_layers(richer, depth, True)) == 2
+    assert further_layers(paths, depth, False) == ()
 
 
-def test_gains_scale_the_power_of_the_layers(asked, model, richer):
+def test_weak_paths_are_left_out_of_the_layers(asked, richer, layers, monkeypatch):
+    monkeypatch.setattr(cheap_replay, "WEAK", 1e-3)
+    trace, power = asked.setup.study.trace, powers(richer)
+    share = power / np.bincount(richer.link, power)[richer.link]
+    strong = further_layers(richer, trace.max_depth, trace.diffraction)
+    left_out = sum(layer.num_paths for layer in layers) - sum(layer.num_paths for layer in strong)
+    assert 0 < left_out <= (share < 1e-3).sum()
+
+
+def test_gains_scale_the_power_of_the_layers(asked, richer, layers):
+    paths = asked.setup.trace()
     parameters = with_constants(asked.parameters, richer.materials)
+    layered = Replay(with_layers(paths, layers), parameters)
+    model = ReplayedModel(layered, 3, ProblemRows(asked), len(layers))
     point = asked.parameters.to_search(asked.parameters.start)[None]
     constants = model.constants.centre[: len(parameters) - 3]
     candidate = parameters.from_search(np.hstack([point, constants[None]]))
     all_paths, study_paths = (
-        asked.residuals(candidate[:, :3], Replay(paths, parameters).path_loss(candidate))
-        for paths in (richer, asked.setup.trace())
+        asked.residuals(candidate[:, :3], Replay(part, parameters).path_loss(candidate))
+        for part in (richer, paths)
     )
     for log_gain, expected in ((0.0, all_paths), (-40.0, study_paths)):
-        gains = np.full(model.layers, log_gain)
-        # Weak paths are left out of the layers.
-        assert model.residuals(point, np.hstack([constants, gains])[None]) == pytest.approx(
-            expected, abs=0.01
-        )
+        gains = np.full(len(layers), log_gain)
+        answer = model.residuals(point, np.hstack([constants, gains])[None])
+        assert answer == pytest.approx(expected, abs=1e-6)
     assert np.abs(all_paths - study_paths).max() > 0.05
 
 
