@@ -345,10 +345,12 @@ def _trace(
             path = np.repeat(np.arange(mixed.num_paths), np.diff(mixed.first))
             diffuse = np.unique(path[mixed.kind == InteractionKind.DIFFUSE])
             engine_paths = concatenate([engine_paths, take(mixed, diffuse)])
-        return engine_paths, *(
+        richer = replace(cheap, max_depth=cheap.max_depth + DEEPER, diffraction=True)
+        cheap_paths, deeper_paths = (
             _paths(scene, believed, _Links(site.tx, site.rx), frequency, settings, simple)
-            for settings in (cheap, replace(cheap, max_depth=cheap.max_depth + DEEPER, diffraction=True))
+            for settings in (cheap, richer)
         )
+        return engine_paths, cheap_paths, deeper_paths
 
 
 @dataclass(frozen=True)

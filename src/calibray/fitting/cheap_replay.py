@@ -136,7 +136,7 @@ class ReplayedModel:
         start = self.engine.parameters.start
         # All candidates share the stored paths, so a link without a path here has no path for any candidate.
         loss = self.engine.path_loss(start[None]).reshape(1 + self.layers, -1)
-        self._reached = np.isfinite(loss).any(axis=0)
+        self._reached = np.asarray(np.isfinite(loss).any(axis=0))
 
     @property
     def known(self) -> NDArray[np.bool_]:
