@@ -1,4 +1,4 @@
-"""Minimising a Student-t likelihood, whose minimum is far from that of the root mean square."""
+"""Minimizing a Student-t likelihood, whose minimum is far from that of the root mean square."""
 
 import numpy as np
 import pytest
@@ -131,7 +131,7 @@ def test_a_value_that_disagrees_with_its_residuals_is_refused(method):
 @pytest.mark.parametrize("method", [LeastSquares, VectorSurrogate, DFOLS])
 @pytest.mark.parametrize("together", [True, False])
 def test_residuals_whose_mean_square_contradicts_the_value_are_refused(method, together):
-    """Plain errors with a Student-t likelihood: the method would minimise another function."""
+    """Plain errors with a Student-t likelihood: the method would minimize another function."""
 
     def objective(residuals):
         return np.sum(np.log1p(residuals**2), axis=1)

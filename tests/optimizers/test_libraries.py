@@ -119,18 +119,18 @@ def test_the_thread_of_a_dropped_run_ends(method):
 
 
 def test_an_error_of_a_library_reaches_the_caller():
-    def minimise(evaluate):
+    def minimize(evaluate):
         evaluate(np.zeros((1, 1)))
         raise ZeroDivisionError("in the library")
 
-    search = inverted(minimise)
+    search = inverted(minimize)
     next(search)
     with pytest.raises(ZeroDivisionError, match="in the library"):
         search.send(Evaluations(np.zeros((1, 1)), np.zeros(1)))
 
 
 def test_the_thread_ends_even_if_the_library_swallows_every_exception():
-    def minimise(evaluate):
+    def minimize(evaluate):
         for _ in range(3):
             try:
                 evaluate(np.zeros((1, 1)))
@@ -138,7 +138,7 @@ def test_the_thread_ends_even_if_the_library_swallows_every_exception():
                 continue
 
     before = threading.active_count()
-    search = inverted(minimise)
+    search = inverted(minimize)
     next(search)
     search.close()
     assert threading.active_count() == before

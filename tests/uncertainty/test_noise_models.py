@@ -143,7 +143,7 @@ def test_each_gap_may_have_its_degrees_of_freedom_and_priors():
     assert np.ptp(found) > 1.0
 
 
-def test_gross_errors_are_recognised():
+def test_gross_errors_are_recognized():
     """With one link of ten 20 dB off, the model with gross errors has the largest weight."""
     random = np.random.default_rng(5)
     position = random.uniform(0, 600, (60, 2))
@@ -175,7 +175,7 @@ def test_every_kind_is_planted():
 
 @pytest.mark.parametrize("kind", PLANTED)
 def test_planted_errors_favour_their_kind(kind):
-    """For 150 links, the planted kind gets the largest weight; a planted offset is recognised."""
+    """For 150 links, the planted kind gets the largest weight; a planted offset is recognized."""
     random = np.random.default_rng(8)
     position, excess = random.uniform(0, 600, (150, 2)), random.normal(15, 8, 150)
     excess[::2] = -np.inf  # in sight

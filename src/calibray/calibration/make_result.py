@@ -255,7 +255,7 @@ def _lost_paths(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float64]) -> tuple[Remark, ...]:
     """A remark if the initial values, with path loss `start_db` [L], fit better than the method's best candidate.
 
-    With priors or further observables, the method minimises more than the RMSE of path loss, so no remark is made.
+    With priors or further observables, the method minimizes more than the RMSE of path loss, so no remark is made.
     """
     study = problem.setup.study
     priors = [entry.prior for entry in (*study.parameters.values(), *study.nuisance_terms.values())]

@@ -41,7 +41,7 @@ class ComparisonProblem:
         starts: Number of further starting points for methods that use several points; None for the methods' default.
         large: Whether evaluations are too expensive for a reference search with many starts.
         minimum: Lowest objective known in advance; +inf if unknown.
-        evaluate: The function to minimise.
+        evaluate: The function to minimize.
         cheap_model: Function that makes a cheap model of `evaluate`; None if there is no cheap model.
         wrong_constants: Whether the cheap model has wrong constants.
     """

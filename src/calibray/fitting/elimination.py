@@ -1,7 +1,7 @@
 """Elimination of the nuisance: computes the best coefficients and projected derivatives for all candidates at once.
 
 Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
-minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. If each link has an entry in only one
+minimize sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. If each link has an entry in only one
 column, each coefficient is a clipped weighted mean.
 
 Otherwise the normal equations have an arrowhead matrix: diagonal blocks bordered by a few columns. Columns of different

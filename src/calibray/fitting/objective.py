@@ -1,4 +1,4 @@
-"""The objective that a calibration minimises.
+"""The objective that a calibration minimizes.
 
 The objective is the paper's weighted RMSE (eq. 1) over the links with nonzero weight. Nuisances (an offset or other
 columns of a linear design) are added to the model: path loss + design x coefficients. For every candidate, the best
@@ -57,7 +57,7 @@ class Share:
     Attributes:
         links: Indices, within the chunk, of the m links with nonzero weight [m].
         measured: Their measured path loss [m], [dB].
-        weight: Weights of these links, normalised as in the objective [m].
+        weight: Weights of these links, normalized as in the objective [m].
         design: The c columns of the nuisance with entries at these links [m, c].
         columns: Indices of these columns in the nuisance [c].
         ceiling_db: Path loss assigned to a link without a path [dB]; None if there is no ceiling.
@@ -237,7 +237,7 @@ class Objective:
         return slope if prior_rows is None else np.concatenate([slope, prior_rows], axis=1)
 
     def value(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The minimised value [n], [dB]: the root mean square of all residuals, including the rows of priors.
+        """The minimized value [n], [dB]: the root mean square of all residuals, including the rows of priors.
 
         The value equals the RMSE if no coefficient has a prior, and is +inf if a link with nonzero weight has no path.
         """
@@ -332,7 +332,7 @@ class Objective:
 
     @cached_property
     def _scale(self) -> NDArray[np.float64]:
-        """Square roots of the links' weights, normalised to a mean square of one."""
+        """Square roots of the links' weights, normalized to a mean square of one."""
         weight = self.weight[self._counted]
         return np.sqrt(weight * len(weight) / weight.sum())
 

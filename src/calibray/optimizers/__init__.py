@@ -1,4 +1,4 @@
-"""Seeded ask/tell optimizers that minimise a function over a box; they do not depend on the radio model.
+"""Seeded ask/tell optimizers that minimize a function over a box; they do not depend on the radio model.
 
 Every class is an `Optimizer`. Each class declares which parts of an evaluation it uses, how it respects a budget, and
 whether it uses starting points. `METHODS` lists the classes by their names in study files; `make` constructs an

@@ -7,7 +7,7 @@ POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems 
 in Optimization with Engineering Applications, SIAM (2017), ch. 40. POUNDERS is implemented here because the authors'
 package IBCDFO needs a solver (MINQ) that is not in any package index. Each residual is modelled by the quadratic of
 least curvature that interpolates evaluated points near the best point. The sum of the squared models, to second order,
-is minimised in a box-shaped trust region. Points that span all directions within the region are chosen first, because
+is minimized in a box-shaped trust region. Points that span all directions within the region are chosen first, because
 they make the models fully linear. If a direction is missing and the step failed, a point along this direction is
 evaluated before the region shrinks.
 
@@ -204,7 +204,7 @@ def _quadratic(offset: NDArray[np.float64]) -> NDArray[np.float64]:
 def _step(
     points: _Points, best: int, kept: NDArray[np.int64], radius: float
 ) -> tuple[NDArray[np.float64], float]:
-    """The step [d] that minimises the model in the trust region, and the predicted decrease in the value."""
+    """The step [d] that minimizes the model in the trust region, and the predicted decrease in the value."""
     offset = (points.unit[kept] - points.unit[best]) / radius
     count, d = offset.shape
     plane = np.hstack([np.ones((count, 1)), offset])

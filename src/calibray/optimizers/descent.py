@@ -1,6 +1,6 @@
 """Projected Levenberg-Marquardt from many starting points in parallel, for least-squares problems in the unit cube.
 
-A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
+A step minimizes the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
 divided by the number of residuals. Components that would leave the cube are fixed at the face of the cube. The system
 is then solved again for the other components, until no component leaves the cube. The damping mu is updated from the
 gain ratio as in H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of

@@ -1,7 +1,7 @@
 """Bayesian optimization: a Gaussian process models the value, and the expected improvement selects candidates.
 
 This method models one value, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
-with a maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R.
+with a maximin Latin hypercube. Every further candidate maximizes the logarithm of the expected improvement (D. R.
 Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; for the logarithm, see S. Ament et al., NeurIPS
 2023, arXiv:2310.20708). In the model, a failed evaluation has the worst successful value.
 """

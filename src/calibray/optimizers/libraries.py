@@ -1,4 +1,4 @@
-"""Minimisers from other libraries, run as ask/tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
+"""Minimizers from other libraries, run as ask/tell searches: CMA-ES, DFO-LS and SciPy's differential evolution.
 
 - CMA-ES, from the author's package `cma`: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772. The
   search starts in the middle of the unit cube with a step size of 0.3.
@@ -11,7 +11,7 @@
 All methods start at the best point already passed to `tell`, if any. If a search converges before the budget is used
 up, the method restarts from a random point or population.
 
-A minimiser that calls its objective runs in a separate thread, and waits in the objective for the evaluation. Only
+A minimizer that calls its objective runs in a separate thread, and waits in the objective for the evaluation. Only
 one of the two threads runs at a time, so a run is as reproducible as the library itself. If a search is dropped before
 its end, the objective raises an exception inside the library, which ends the thread.
 """
@@ -34,18 +34,18 @@ from calibray.optimizers.protocol import Optimizer, Search, Session, first_start
 from calibray.support.lazy_imports import library
 
 Evaluate = Callable[[NDArray[np.float64]], Evaluations]
-"""The function that a minimiser calls: it maps candidates [n, d] to their evaluations."""
+"""The function that a minimizer calls: it maps candidates [n, d] to their evaluations."""
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; a `BaseException`, because a library might catch an `Exception`."""
+    """Ends a minimizer whose search was dropped; a `BaseException`, because a library might catch an `Exception`."""
 
 
-def inverted(minimise: Callable[[Evaluate], None]) -> Search:
-    """Run a minimiser in a thread, and yield the candidates [n, d] for which the minimiser requests evaluations.
+def inverted(minimize: Callable[[Evaluate], None]) -> Search:
+    """Run a minimizer in a thread, and yield the candidates [n, d] for which the minimizer requests evaluations.
 
     Raises:
-        Exception: Any exception that `minimise` raises.
+        Exception: Any exception that `minimize` raises.
     """
     questions: SimpleQueue[NDArray[np.float64] | BaseException | None] = SimpleQueue()
     answers: SimpleQueue[Evaluations | None] = SimpleQueue()
@@ -60,14 +60,14 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
     def work() -> None:
         try:
-            minimise(evaluate)
+            minimize(evaluate)
             questions.put(None)
         except _AbandonedError:
             pass
         except BaseException as error:
             questions.put(error)
 
-    thread = Thread(target=work, name="minimiser", daemon=True)
+    thread = Thread(target=work, name="minimizer", daemon=True)
     thread.start()
     try:
         while (question := questions.get()) is not None:
@@ -174,11 +174,11 @@ class DFOLS(Optimizer):
     def _search(self, archive: Archive) -> Search:
         # The thread holds no reference to this object, so the thread ends when this object is dropped.
         solve, radii = self._dfols.solve, (self.radius, self.tolerance)
-        minimise = partial(_minimise_residuals, solve, radii, self._budget, archive, self._rng)
-        return limited(inverted(minimise), self._budget)
+        minimize = partial(_minimize_residuals, solve, radii, self._budget, archive, self._rng)
+        return limited(inverted(minimize), self._budget)
 
 
-def _minimise_residuals(
+def _minimize_residuals(
     solve: Callable[..., Any],
     radii: tuple[float, float],
     budget: int,
@@ -186,7 +186,7 @@ def _minimise_residuals(
     rng: np.random.Generator,
     evaluate: Evaluate,
 ) -> None:
-    """Minimise from one starting point after another; the caller ends the loop."""
+    """Minimize from one starting point after another; the caller ends the loop."""
     box = archive.box
     d = box.dimension
 
@@ -235,12 +235,12 @@ class DifferentialEvolution(Optimizer):
 
     def _search(self, archive: Archive) -> Search:
         # The thread holds no reference to this object, so the thread ends when this object is dropped.
-        minimise = partial(_evolve, self.population, archive, self._rng)
-        return limited(inverted(minimise), self._budget)
+        minimize = partial(_evolve, self.population, archive, self._rng)
+        return limited(inverted(minimize), self._budget)
 
 
 def _evolve(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
-    """Minimise with one population after another; the caller ends the loop."""
+    """Minimize with one population after another; the caller ends the loop."""
     box = archive.box
 
     def objective(unit: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form

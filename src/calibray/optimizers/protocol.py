@@ -164,13 +164,13 @@ AS_GIVEN: Final = Schedule(lambda budget: {"budget": budget})
 
 
 class Optimizer(ABC):
-    """A method that minimises a function over a box; the caller runs the loop.
+    """A method that minimizes a function over a box; the caller runs the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class receives its
     settings in the constructor and passes its algorithm to a `Session`. It sets the attributes below whose defaults do
     not apply, and overrides nothing else.
 
-    The value can be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
+    The value can be any number, such as an error or a negative log likelihood. A method that uses residuals minimizes
     their mean square, so the value must increase with the mean square. For a likelihood, pass deviance residuals
     sign(r) sqrt(2 (l(r) - l(0))) to `tell`, where r are residuals with negative log likelihood l.
 

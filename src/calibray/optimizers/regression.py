@@ -16,7 +16,7 @@ C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT
 
 `Kriging` interpolates all residuals with length scales that are estimated from the residuals. Every residual is a
 linear trend plus a weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input
-scales. There is one scale per parameter, so a parameter without influence drops out. The scales maximise the restricted
+scales. There is one scale per parameter, so a parameter without influence drops out. The scales maximize the restricted
 log likelihood summed over all residuals. With tens of links, a dozen points determine these scales well. The variance
 of each residual is profiled out.
 """

@@ -267,7 +267,7 @@ def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> 
     """Gain of a link's antenna in the horizontal plane at the given bearings, relative to the maximum [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
-    # Azimuths on the horizon are measured anticlockwise from east, and bearings clockwise from north.
+    # Azimuths on the horizon are measured counter-clockwise from east, and bearings clockwise from north.
     angles = np.stack([np.full(len(bearing), np.pi / 2), np.pi / 2 - bearing], axis=1)
     jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), wave_basis(angles), pose)
     power = (np.abs(jones) ** 2).sum(axis=(1, 2))

@@ -302,7 +302,7 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
                     f"output file {path}: another program replaced {partial}; choose another folder"
                 )
         if signed:
-            # The file is signed first, so that the next run recognises it even if the process is killed between the two
+            # The file is signed first, so that the next run recognizes it even if the process is killed between the two
             # steps.
             _sign(partial, path)
         partial.replace(path)

@@ -10,7 +10,7 @@ Censored links are known only to lie below the noise floor. A measured link cont
 censored link contributes the probability that its error is at least as large as the floor requires (J. Tobin,
 Econometrica 26, 1958). Without the censored links, only links with favourable errors would remain near the floor. For
 errors e = s u, with u standard normal or Student's t, and nuisance coefficients b, damped Newton steps in b and log s
-maximise the logarithm of
+maximize the logarithm of
 
     p(b, s) = prod_measured f((y - z.b) / s) / s  x  prod_censored S((y - z.b) / s)  x  prior(b) / s.
 """

@@ -335,7 +335,7 @@ class Marginal:
         design, ridge = self._with_offset(bool(offset.any()))
         by_gap = np.tile(ridge / self.noise_db, (len(gap), 1))
         if offset.any():
-            # A ridge this large fixes the offset at 0. The normalisation of the offset's prior cancels the integral
+            # A ridge this large fixes the offset at 0. The normalization of the offset's prior cancels the integral
             # over the offset.
             by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])

@@ -2,9 +2,9 @@
 
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
 because clutter that the scene lacks shadows all these receivers. The covariance of this part falls off exponentially
-with distance. Range and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971),
+with distance. Range and size maximize the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971),
 which prevents the fit of the parameters from biasing the noise estimate downwards. The fit is exact, with one Cholesky
-factorisation per trial, for up to a few thousand links.
+factorization per trial, for up to a few thousand links.
 
 Whitening makes errors independent. For up to a few hundred links, the covariance matrix of the errors is factored. For
 more links, each error is modelled as its conditional mean given the errors of the nearest earlier links, plus an

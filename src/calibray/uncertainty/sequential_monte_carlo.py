@@ -269,7 +269,7 @@ def _anneal(
         if step == MAX_STEPS - 1:
             power = 1.0
         rise = (power - before) * population.log_likelihood
-        # The log evidence grows by the logarithm of the mean of likelihood^rise, the ratio of successive normalising
+        # The log evidence grows by the logarithm of the mean of likelihood^rise, the ratio of successive normalizing
         # constants.
         evidence += float(np.logaddexp.reduce(rise)) - np.log(size)
         # Moves use differences between members at fixed index distances, so copies of a member must not be neighbours.

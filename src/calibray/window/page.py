@@ -246,7 +246,7 @@ class Camera:
     """A camera on a sphere around the scene.
 
     Attributes:
-        azimuth: Azimuth, counterclockwise from east [rad].
+        azimuth: Azimuth, counter-clockwise from east [rad].
         elevation: Elevation above the horizon [rad].
         distance: Distance from the centre of the scene.
     """

@@ -17,7 +17,7 @@ accepted only if it makes the answers more probable.
 A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
 well but predict minima at different points. The lowest of these predictions would be too optimistic. Predictions are
 therefore averaged over ensemble members drawn from the posterior of the constants. Each member is corrected until it
-passes through all answers. The uncertainty is small where the members agree. Members are drawn by randomised maximum
+passes through all answers. The uncertainty is small where the members agree. Members are drawn by randomized maximum
 likelihood: each member is fitted from a different starting point, to answers and a prior that are both perturbed
 according to their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is scaled
 according to the errors of earlier predictions at points that were not yet used in a fit.

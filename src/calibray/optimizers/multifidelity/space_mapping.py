@@ -1,4 +1,4 @@
-"""Space mapping minimises an expensive model with the help of a cheap model, which is corrected after every call.
+"""Space mapping minimizes an expensive model with the help of a cheap model, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
 The first call evaluates the minimum of this approximation. After every call, the cheap model is corrected until it

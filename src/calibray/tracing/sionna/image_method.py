@@ -7,7 +7,7 @@ on the source and apply to all receivers.
 
 Unfolding a sequence yields the points at which its paths must aim. By the method of images, a path with reflections is
 a straight line to the image of the source (ITU-R P.1411). An edge is mirrored in the planes that follow it; the
-diffraction point minimises the length of the unfolded path (Keller, J. Opt. Soc. Am. 52(2), 1962). Most
+diffraction point minimizes the length of the unfolded path (Keller, J. Opt. Soc. Am. 52(2), 1962). Most
 sequence-receiver pairs can be excluded immediately, because the line would cross a plane where the scene has no
 surface. Sionna's own image method computes the paths of the remaining pairs.
 """
