@@ -52,7 +52,7 @@ have up to two more (`benchmarks/problem_families/family.py`)."""
 LONGEST_TRACE: Final = 60.0
 """Estimated duration of a trace above which no further paths are traced [s]."""
 
-WEAK: Final = 3e-3
+WEAK: Final = 1e-2
 """Share of a link's power below which a further path is left out. In development offices 1018 and 63, with 297 and 449
 interactions, limits of 0.1, 0.3 and 1 % add 1,357 and 2,091, 923 and 1,298, and 451 and 583 interactions."""
 
