@@ -1,15 +1,16 @@
-"""Engines compute the path loss of candidates.
+"""Engines compute the path loss of links for candidate parameter values.
 
-- `Replay` evaluates stored paths and their derivatives in microseconds to milliseconds per candidate.
+- `Replay` evaluates stored paths, with derivatives, in microseconds to milliseconds per candidate.
 - `ReplayCarriers` evaluates stored paths at several carriers.
-- `ChunkedReplay` replays chunks of links in this process or on workers, and can return sums over links instead of one
+- `ChunkedReplay` replays links in chunks, in this process or on workers, and can return sums over links instead of one
   value per link.
 - `Retrace` runs the ray tracer again for every candidate, as the paper does.
 - `Command` calls an external program.
-- `Recorded` adds a `Ledger` to `Retrace` or `Command`, so that no RT call is repeated.
+- `Recorded` stores the answers of `Retrace` or `Command` in a `Ledger`, so that no RT call is repeated.
 
-An RT call is one run of an engine for one candidate and all links. Every engine counts its own calls. `engines.kinds`
-defines the engine sections of a study file and is imported with the study. JAX is loaded on first use.
+An RT call is one run of an engine that evaluates one candidate for all links. Every engine counts its own calls.
+`engines.kinds` defines the engine sections of a study file and is imported whenever a study is read. JAX is loaded on
+first use.
 """
 
 from typing import TYPE_CHECKING

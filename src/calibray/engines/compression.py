@@ -1,15 +1,15 @@
-"""Compression replaces tens of thousands of paths with a few weighted paths, within a stated error in path loss.
+"""Compression replaces tens of thousands of paths by a few weighted paths, with a stated maximum error in path loss.
 
 The power of a link is a sum over its paths, P(x) = sum_p p_p(x), where x is the candidate. Within the bounds of a few
 parameters, the functions p_p(x) span a low-dimensional space, so a few paths with weights w_p >= 0 suffice. The
 weighted sum sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added
-greedily until the fit is accurate enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015)
+greedily until the fit is sufficiently accurate (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015)
 1077).
 
-The weights are non-negative and the paths are physical, so a compressed link remains physically plausible between the
-training candidates. Nevertheless, the error is checked at new candidates, many of which have parameters at their
-bounds. If a link's error at the new candidates exceeds half the tolerance, the link is fitted again to more candidates.
-After several failed fits, the link keeps all its paths.
+The weights are non-negative and the paths are physical, so the power of a compressed link remains physically plausible
+between the training candidates. Nevertheless, the error is checked at new candidates, many of which have parameters at
+their bounds. If a link's error at these candidates exceeds half the tolerance, they join the training candidates and
+the link is fitted again. After several failed fits, the link keeps all its paths.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
 TOLERANCE_DB: Final = 0.01
-"""Default tolerance on the error in a link's path loss [dB]."""
+"""Default maximum error in a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
-"""A link with at most this number of paths is not compressed, because the benefit would be small."""
+"""Number of paths up to which a link is not compressed, because the benefit would be small."""
 
 FIT_SHARE: Final = 0.1
-"""Share of the tolerance that the fit may use; the rest is a margin for candidates between the training candidates."""
-
-CHECK_SHARE: Final = 0.5
-"""Maximum accepted error at new candidates, as a share of the tolerance; the rest is a margin for unchecked
+"""Maximum error of the fit as a share of the tolerance; the rest is a margin for candidates other than the training
 candidates."""
 
+CHECK_SHARE: Final = 0.5
+"""Maximum error at new candidates as a share of the tolerance; the rest is a margin for unchecked candidates."""
+
 TRAINING: Final = 16
-"""The first fit uses TRAINING * (d + 1) random candidates for d parameters, in addition to corners of the bounds."""
+"""For d parameters, the first fit uses TRAINING * (d + 1) random candidates in addition to the corners of the
+bounds."""
 
 CORNER_PARAMETERS: Final = 5
-"""Maximum number of parameters whose bounds define the corners; all other parameters are in the middle of their
-ranges."""
+"""Maximum number of parameters whose bounds are combined into corners; all others are in the middle of their ranges."""
 
 CHECKED: Final = 48
 """Number of new candidates in every check."""
@@ -55,11 +55,10 @@ ROUNDS: Final = 6
 """Maximum number of fits of a link; if all fits fail the check, the link keeps all its paths."""
 
 RANKING: Final = 16
-"""Number of candidates used to rank the paths by power."""
+"""Number of candidates at which the paths are ranked by power."""
 
 POOL: Final = 2000
-"""Maximum number of a link's strongest paths in the fit, and maximum number of its other paths, which are chosen at
-random."""
+"""Maximum number of a link's strongest paths in the fit, and also of its other paths, which are chosen at random."""
 
 BATCH_POWERS: Final = 400_000_000
 """Maximum number of powers (paths times candidates) in memory at once."""
@@ -77,7 +76,7 @@ class Compressed:
             The compressed program is therefore valid only for sums of powers, not for delays or sums of fields.
         error_db: Largest difference in path loss between the compressed and the full program at the checked candidates
             [L], [dB].
-        candidates: Number of candidates, not used in the fit, at which every compressed link was checked.
+        candidates: Number of candidates, none of them used in the fit, at which every compressed link was checked.
     """
 
     paths: Paths
@@ -86,7 +85,7 @@ class Compressed:
 
 
 def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERANCE_DB) -> Compressed:
-    """Compress a program; the result is valid for the parameters within their bounds and for power summed over paths.
+    """Compress a program. The result is valid for parameters within their bounds and for power summed over paths.
 
     `tolerance_db` is the maximum permitted error in a link's path loss [dB]. Returns the compressed program and its
     error.
@@ -113,7 +112,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
             in_batch = slice(ends[link] - start, ends[link + 1] - start)
             fit = _fit_link(powers, in_batch, [total[:, link] for total in totals], tolerance_db)
             if fit is not None:
-                # Paths of the link that are not in the pool are left out.
+                # Paths of the link outside the pool are left out.
                 weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
                 weight[pool[ends[link] : ends[link + 1]]], error[link] = fit
     kept = np.flatnonzero(weight > 0)
@@ -128,11 +127,12 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """Omit the weakest paths of every link, which together carry at most `share` of the link's power.
+    """Omit the weakest paths of every link, so that the omitted paths together carry at most `share` of the link's
+    power.
 
-    The power shares are summed over candidates spread over the parameters' bounds, so the omitted paths carry at most
-    `share` of the power at each of these candidates. The returned program is valid for sums of powers. Raises
-    InputError if a parameter's material is not in the paths.
+    A path's shares of the power are summed over candidates spread over the parameters' bounds, so the omitted paths
+    carry at most `share` of the power at each of these candidates. The returned program is valid for sums of powers.
+    Raises InputError if a parameter's material is not in the paths.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -148,8 +148,8 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
 def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
     """Training candidates, which include corners of the bounds, followed by the candidates of each check [n, d].
 
-    A fit is least accurate where it extrapolates. For half of the candidates in a check, each parameter is therefore at
-    one of its bounds with a probability of one half.
+    A fit is least accurate where it extrapolates. In half of the candidates of each check, every parameter is therefore
+    set to one of its bounds with probability one half.
     """
     from scipy.stats import qmc  # the import takes 0.4 s
 
@@ -171,7 +171,7 @@ def _evaluate_all(
     """Evaluate the whole program.
 
     Returns the power of every link for each set of candidates [n, L], the strength of every path [P], and the largest
-    error of a tabulated coefficient. The strength of a path is its share of the link's power, summed over the ranking
+    error of any tabulated coefficient. The strength of a path is its share of the link's power, summed over the ranking
     candidates.
     """
     plan = layout(paths, np.float32, intervals, phases=False)
@@ -190,7 +190,8 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Ascending indices of the paths in the fits: the strongest and some random paths of every link with many paths."""
+    """Indices of the paths in the fits, in ascending order: for every link with many paths, the strongest and some
+    random paths."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:
@@ -202,13 +203,13 @@ def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
 def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
-    """Divide links into batches that are small enough for the powers of their paths in the pool to fit into memory."""
+    """Divide links into batches so small that the powers of each batch's paths in the pool fit into memory."""
     batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
     return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
 
 class _Powers:
-    """Powers of paths at sets of candidates, computed on first use."""
+    """Powers of paths at sets of candidates; the powers at a set are computed on first use."""
 
     def __init__(
         self, paths: Paths, parameters: Parameters, candidates: list[NDArray[np.float64]], intervals: int
@@ -232,7 +233,7 @@ def _fit_link(
 ) -> tuple[NDArray[np.float64], float] | None:
     """Weights of a link's paths in the pool, and largest error at new candidates; None if no fit is accurate enough.
 
-    Candidates at which the link has no power, for instance because nothing scatters, are omitted, because weights
+    Candidates at which the link has no power (for example because no surface scatters) are omitted, because weights
     cannot change a power of zero.
     """
     # Largest relative error of a power, converted from decibels.
@@ -242,13 +243,13 @@ def _fit_link(
         positive = total > 0
         share = powers.at(index, paths)[positive] / total[positive, None]
         if index:
-            # The first set serves only for training; each further set checks the fit to all earlier sets.
+            # The first set is used only for training; each later set checks the fit to all earlier sets.
             weight = sparse_weights(np.vstack(shares), bound, first)
             first = np.flatnonzero(weight)
             error = float(np.abs(10 * np.log10(share @ weight)).max(initial=0.0))
             if error <= CHECK_SHARE * tolerance_db:
                 return weight, error
-        # Candidates that revealed an error join the training candidates.
+        # If the error is too large, the checked candidates join the training candidates.
         shares.append(share)
     return None
 

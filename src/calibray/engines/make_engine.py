@@ -39,14 +39,14 @@ def make(
     Args:
         study: The study, opened or not.
         name: "replay", "retrace" or "command"; if None, the study's engine.
-        progress: Called after every launch of a trace ("tracing") or after every RT call of a batch ("running").
-        ledger: SQLite file that stores RT calls. Replay does not use the ledger, because replaying is faster than
-            reading the file.
-        workers: Workers that run the calls of a batch ("command") or hold chunks of links ("replay").
+        progress: Called with "tracing" after every launch of a trace, or with "running" after every RT call of a batch.
+        ledger: SQLite file that stores RT calls. Replay does not use the ledger, because evaluating paths is faster
+            than reading stored answers.
+        workers: Workers that run the calls of a batch (engine "command") or keep chunks of links (engine "replay").
         paths: Paths of the study's links for "replay"; if None, the paths are traced or read from the cache.
 
     Returns:
-        The engine, for all links of the study, including held-out links.
+        The engine for all links of the study, including held-out links.
 
     Raises:
         InputError: The engine is unknown, is unsuitable for the study, or does not support workers; or the ledger, or
@@ -78,9 +78,9 @@ def make(
 def fingerprint(study: OpenedStudy) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
-    The method, seed, measured values, bounds and start values are excluded, so studies that differ only in these
-    respects share stored calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's
-    version is unknown, so its command line is included instead.
+    The method, seed, measured values, bounds and start values are excluded, so that studies which differ only in these
+    share stored calls. For re-tracing, the fingerprint includes the tracer's versions. An external program's version is
+    unknown, so its command line is included instead.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
     # Calibrated constants are part of the candidate.
@@ -121,7 +121,7 @@ def fingerprint(study: OpenedStudy) -> str:
 
 
 def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[str, object]]:
-    """For every material by name, the constants that are not calibrated."""
+    """The constants of every material, by name, that are not calibrated."""
     return {
         name: {
             constant: value
@@ -133,7 +133,7 @@ def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[
 
 
 def _geometry(scene: Scene) -> bytes:
-    """The scene's XML without material constants, because calibrated constants belong to the candidate."""
+    """The scene's XML without material constants, because the candidate contains the calibrated constants."""
     root = ElementTree.fromstring(scene.xml)
     for constants in root.findall("bsdf"):
         root.remove(constants)

@@ -1,4 +1,4 @@
-"""Errors in the stated directions and gains of transmit antennas, modelled as an effect on stored paths."""
+"""Errors in the stated orientations and gains of transmit antennas, modelled as an effect on stored paths."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ XP: Final = SimpleNamespace(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Deviations of T transmit antennas from their stated directions and gains, for P paths and M poses.
+    """Deviations of T transmit antennas from their stated orientations and gains, for P paths and M poses.
 
     Attributes:
-        basis: Directions of departure and their basis vectors [3, 3, P]; see `wave_basis`.
+        basis: Direction of departure of every path with its basis vectors [3, 3, P]; see `wave_basis`.
         axis: Theta vector of every path in the frame of its first interaction [P, 2].
-        pose: Stated directions, each shared by several paths [M].
+        pose: Stated orientations [M], each shared by several paths.
         mounted: Index of every path's pose [P].
         of_antenna: Indices of the paths of each antenna.
         transmitter: Index of every pose's transmitter [M].
-        weights: Changes in the yaw [rad], downtilt [rad] and gain [dB] of every transmitter per unit of each of the e
-            effect parameters [3, T, e].
+        weights: Changes [3, T, e] in the yaw [rad], downtilt [rad] and gain [dB] of every transmitter, per unit of each
+            of the e effect parameters.
         antennas: The distinct antennas.
-        gains: Content of the antennas as text, which triggers a new compilation if a gain file changes but keeps its
-            name.
+        gains: Content of the antennas as text, so that a gain file that changes but keeps its name triggers a new
+            compilation.
     """
 
     basis: Any
@@ -120,7 +120,7 @@ def pose_error(
     """The errors described by parameters such as "tx:CELL.azimuth"; None if there are no such parameters.
 
     Args:
-        paths: The paths, with the fields of the stated antennas.
+        paths: The paths with the fields of the antennas as stated.
         mounting: The stated transmit antennas.
         labels: Name of every link's transmitter [L].
         effect_parameters: The parameters of all effects, in the order of their values.
@@ -142,7 +142,7 @@ def pose_error(
             weights[FIELDS.index(parameter.field), chosen, number] = unit[parameter.field]
     if not weights.any():
         return None
-    # Links of one transmitter share their pose, so its sines are computed only once.
+    # Links of one transmitter share its pose, so the sines of the pose's angles are computed only once.
     keys = np.column_stack([*mounting.pose, transmitter.reshape(-1)])
     shared, of_link = np.unique(keys, axis=0, return_inverse=True)
     antenna = mounting.index[paths.link]

@@ -1,4 +1,5 @@
-"""The process that owns a claim or a temporary folder, so that other processes can check whether it is still alive."""
+"""Identity of the process that owns a claim or a temporary folder, with which other processes check whether it is still
+alive."""
 
 from __future__ import annotations
 
@@ -12,10 +13,10 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Maximum accepted difference between two readings of a process's start time [s].
+"""Maximum accepted difference [s] between two readings of a process's start time.
 
-A start time since 1970 changes if the system clock is corrected between the readings. The system does not reuse a
-process number within this time, because all other numbers are used first.
+A start time relative to 1970 changes if the system clock is corrected between the readings. Two processes with the same
+number differ by more than this, because the system uses all other numbers before it reuses one.
 """
 
 
@@ -25,12 +26,11 @@ class ProcessOwner:
 
     Attributes:
         host: The machine.
-        namespace: The process namespace, in which a container numbers its own processes; empty if unknown.
+        namespace: The process namespace, because each container numbers its processes separately; empty if unknown.
         pid: The process number.
-        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown], which is needed because
-            process numbers are reused.
-        boot: Boot identifier, which is needed because process numbers refer to other processes after a reboot; empty if
-            unknown.
+        started: Start time of the process [s since boot, or since 1970 if `boot` is unknown]; needed because process
+            numbers are reused.
+        boot: Boot identifier; needed because process numbers refer to other processes after a reboot; empty if unknown.
     """
 
     host: str
@@ -71,7 +71,7 @@ class ProcessOwner:
 
     @property
     def is_gone(self) -> bool:
-        """Whether the process is known to have ended; False on another machine or in another container."""
+        """Whether the process is known to have ended; False if it runs on another machine or in another container."""
         if (self.host, self.namespace) != _machine():
             return False
         if self.boot != _boot():

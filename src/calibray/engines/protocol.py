@@ -20,7 +20,7 @@ from calibray.support.progress import Progress
 
 @runtime_checkable
 class Engine(Protocol):
-    """An engine computes the path loss of candidates."""
+    """An engine computes the path loss of all links for candidates."""
 
     @property
     def calls(self) -> int:
@@ -89,19 +89,20 @@ class Responses:
     observed_slope: NDArray[np.float64] | None = None
 
     def arrays(self) -> list[NDArray[np.float64]]:
-        """Path loss, observables and, if available, their derivatives."""
+        """Path loss and observables, followed by their derivatives where available."""
         every = self.path_loss, self.observed, self.loss_slope, self.observed_slope
         return [array for array in every if array is not None]
 
 
 def joined(parts: Sequence[Responses]) -> Responses:
-    """Combine the responses of successive batches of candidates."""
+    """Combine the responses for successive batches of candidates."""
     columns = zip(*(part.arrays() for part in parts), strict=True)
     return Responses(*(np.concatenate(column) for column in columns))
 
 
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
-    """Combine the responses of subsets of the links; `links` contains the indices [l] of each subset's links."""
+    """Combine the responses for subsets of the links; `links` contains, for each subset, the indices [l] of its
+    links."""
     count, arrays = sum(map(len, links)), []
     # Axis of the links in path loss, in observables, and in the derivatives of both quantities.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):
@@ -130,15 +131,16 @@ class Observing(Engine, Protocol):
 
 
 Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
-"""Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
+"""Reduces a chunk's path loss [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums over the chunk's
+links."""
 
 Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
-"""Maps candidates [n, d] and a flag that requests derivatives to the results of the reductions of all chunks."""
+"""Maps candidates [n, d], with a flag that requests derivatives, to the results of all chunks' reductions."""
 
 
 @runtime_checkable
 class Chunked(Differentiable, Protocol):
-    """An engine whose links are divided into chunks, which can be on other machines."""
+    """An engine whose links are divided into chunks, which may be kept on other machines."""
 
     @property
     def chunks(self) -> Sequence[NDArray[np.int64]]:
@@ -146,9 +148,9 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """Make a function of candidates that reduces each chunk's path loss on a worker, so that little data is sent.
+        """Make a function of candidates that reduces each chunk's path loss on its worker, so that little data is sent.
 
-        Every chunk has one reduction, which is sent to its worker once.
+        Every chunk has its own reduction, which is sent to the chunk's worker once.
         """
         ...
 
@@ -165,21 +167,21 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
-        """The same engine with paths traced with other materials; `progress` is called after every chunk."""
+        """The same engine, but with its paths traced with other materials; `progress` is called after every chunk."""
         ...
 
 
 @runtime_checkable
 class ReplaysScene(Protocol):
-    """An engine with stored paths that can leave out effects, because an exported scene does not contain effects."""
+    """An engine with stored paths that can omit effects, as needed to predict the path loss in an exported scene."""
 
     def scene_path_loss(
         self, candidates: NDArray[np.float64], walls: Mapping[str, str]
     ) -> NDArray[np.float64]:
         """Path loss [n, L], [dB], of the scene alone for candidates [n, d] in the parameters' units.
 
-        Effects on paths, such as the loss in regions, are omitted. `walls` maps the name of every facade to the scene
-        material of its wall.
+        Effects on paths, such as the loss in regions, are omitted. `walls` maps the name of every facade to the
+        material that its wall has in the scene.
         """
         ...
 
@@ -193,8 +195,8 @@ class Answer:
         path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links of a failed call.
         seconds: Duration of the call [s].
         failure: Error message that names the engine and the candidate; empty if the call succeeded.
-        rays: The unchanged response of a program that returns rays, or else further observables [K, L] in SI units as
-            little-endian doubles; empty if there are neither.
+        rays: If the program returns rays, its unchanged response; otherwise, any further observables [K, L] in SI units
+            as little-endian doubles; empty if there are neither.
         lost: Whether the call failed because its worker or guard ended, which is not the program's fault. The ledger
             does not store such a failure.
     """
@@ -209,7 +211,7 @@ class Answer:
 
 @runtime_checkable
 class Answering(Engine, Protocol):
-    """An engine with expensive calls, which returns each answer of a batch as soon as the answer arrives.
+    """An engine with expensive calls, which returns each answer in a batch as soon as it arrives.
 
     The method `path_loss` returns +inf for all links of a failed candidate. The method raises EngineError if every
     candidate of the first batch fails, if too many successive calls fail, or if the ledger or the files of a call
@@ -225,12 +227,12 @@ class Answering(Engine, Protocol):
         """Yield the answer to each of the candidates [n, d], in the parameters' units, as soon as its call ends.
 
         After another thread sets `stop`, no further call starts, and running calls are stopped if possible. Answers
-        that have already arrived are still yielded.
+        that have already arrived by then are still yielded.
 
         Raises:
             InputError: A value is unphysical.
-            EngineError: Too many successive calls failed, or a call's files cannot be written; all earlier answers were
-                yielded.
+            EngineError: Too many successive calls failed, or a call's files cannot be written; all earlier answers have
+                been yielded.
         """
         ...
 
@@ -238,7 +240,7 @@ class Answering(Engine, Protocol):
 def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
     """Collect the path loss [n, L], [dB], of a batch of answers; +inf for all links of a failed candidate.
 
-    If the whole first batch fails, the engine is assumed to be at fault.
+    If the whole first batch fails, the engine itself is assumed to be at fault.
 
     Raises:
         EngineError: Every candidate of the first batch failed.

@@ -1,1 +1,1 @@
-"""Chunks of links, and the processes and machines that process the chunks."""
+"""Chunks of links, and the worker processes and machines that trace and replay them."""

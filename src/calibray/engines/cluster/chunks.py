@@ -1,9 +1,9 @@
-"""Division of links into chunks, work done once per chunk on a worker (tracing, prediction), and chunked replay.
+"""Division of links into chunks, work that a worker does once per chunk (tracing, prediction), and chunked replay.
 
-The division, and thus every result, depends only on the links and the study, never on the workers. Chunks traced by one
-command can therefore be read from the cache by a later command. For replay, each chunk is traced and compiled on one
-worker, which keeps the chunk. Candidates are sent to the workers, which return the path loss of their chunks. With
-`reducing`, the workers return only a few sums, regardless of the number of links.
+The division, and thus every result, depends only on the links and the study, not on the number or type of workers.
+A later command can therefore read from the cache the chunks that an earlier command traced. For replay, each chunk is
+traced and compiled on one worker, which keeps the chunk. Candidates are sent to the workers, which return the path loss
+of their chunks. With `reducing`, the workers return only a few sums, regardless of the number of links.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Content = TypeVar("Content")
 Answer = TypeVar("Answer")
 
 CHUNK_LINKS: Final = 1000
-"""Default maximum number of links per chunk, which is raised if there would otherwise be more than `MOST_CHUNKS`
-chunks."""
+"""Default maximum number of links per chunk, raised where necessary to keep the number of chunks at or below
+`MOST_CHUNKS`."""
 
 MOST_CHUNKS: Final = 64
 """Maximum number of chunks if the study does not state a chunk size. The number is limited because every chunk compiles
@@ -56,14 +56,14 @@ its own program.
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 
 _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
-"""Reference to the content that was unpacked last, which keeps the content in memory between two chunks."""
+"""Reference to the most recently unpacked content, which keeps this content in memory from one chunk to the next."""
 
 
 @final
 class Shared(Generic[Content]):
-    """Content that all chunks share, for instance an opened study; each process unpacks it once.
+    """Content that all chunks share, for example an opened study. Each process unpacks the content once.
 
-    A shared study needs to contain only a few links, because each chunk has its own links.
+    A shared study needs only a few links of its own, because each chunk brings its own links.
     """
 
     def __init__(self, content: Content) -> None:
@@ -125,12 +125,13 @@ def _do_task(task: _Task[Any, Any]) -> Any:
 
 
 def identity(value: Content) -> Content:
-    """Return the argument; used if an object is already the answer of a chunk, or if an object is sent unchanged."""
+    """Return the argument. Used where an object is itself the answer of a chunk, or where an object is sent
+    unchanged."""
     return value
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """Make a function that receives the number of a finished chunk and reports the links done so far as "tracing"."""
+    """Make a function that receives the index of a finished chunk and reports the number of links done as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:
@@ -143,19 +144,20 @@ def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) 
 
 
 def chunk_size(stated: int | None, count: int) -> int:
-    """Maximum number of links per chunk, given the number stated in the study and the total number of links."""
+    """Maximum number of links per chunk, from the maximum stated in the study (if any) and the total number of
+    links."""
     return stated or max(CHUNK_LINKS, -(-count // MOST_CHUNKS))
 
 
 def stated_chunk_size(study: OpenedStudy) -> int | None:
-    """The number of links per chunk that a study states; None if the study states no number."""
+    """Maximum number of links per chunk stated in a study; None if the study states none."""
     return getattr(study.engine, "chunk_links", None)
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Divide links into chunks of similar size, with at most `size` links each, whose rays start at few positions.
+    """Divide links into chunks of similar size, so that the rays of each chunk start at few positions.
 
-    Returns the indices of every chunk's links, in ascending order.
+    Each chunk has at most `size` links. Returns the indices of every chunk's links, in ascending order.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 9], [5, 0, 9]] * 2, rx=np.arange(12).reshape(4, 3), path_loss_db=[80] * 4)
@@ -170,14 +172,14 @@ def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
 
 
 def select_links(links: Measurements, chunk: NDArray[np.int64]) -> Measurements:
-    """The links of a chunk, given by their indices."""
+    """The links at the given indices."""
     mask = np.zeros(len(links), dtype=bool)
     mask[chunk] = True
     return links.select(mask)
 
 
 def seconds_to_trace(study: OpenedStudy, chunks: Sequence[NDArray[np.int64]]) -> float:
-    """Estimated time to trace the chunks sequentially on two processor cores [s]."""
+    """Estimated time [s] to trace the chunks one after another on two processor cores."""
     return sum(study.tracer.plan(select_links(study.links, chunk)).seconds for chunk in chunks)
 
 
@@ -187,7 +189,7 @@ def trace_in_chunks(
     """Trace a study's links in the same chunks as a calibration, or read their paths from the cache.
 
     With `check`, every chunk is traced again with twice the samples. Returns the path program of all links and, with
-    `check`, the changes in path loss.
+    `check`, the changes in path loss between the two traces.
 
     Raises:
         InputError: The links cannot be traced, or `check` is set and the study adds samples in rounds.
@@ -198,8 +200,8 @@ def trace_in_chunks(
     one_link = study.at(select_links(links, np.array([0])))
     answers = for_each_chunk(workers, partial(_trace_chunk, check), one_link, links, size, progress)
     paths = join_links([(chunk, chunk_paths) for chunk, (chunk_paths, _) in answers])
-    # If rays are added in rounds, the settings state the number of rays and the last change; the largest values are
-    # kept.
+    # If rays are added in rounds, the settings state the number of rays and the last change. The joined settings keep
+    # the largest value of each.
     worst = {
         name: max(cast(float, chunk_paths.settings[name]) for _, (chunk_paths, _) in answers)
         for name in ("rays", "last_round_db")
@@ -225,10 +227,10 @@ def _trace_chunk(check: bool, study: OpenedStudy, links: Measurements) -> tuple[
 
 
 Open = Callable[[OpenedStudy, Mapping[str, Material]], Differentiable]
-"""Opens the engine of a chunk, given the opened study of its links and the materials for the trace."""
+"""Opens the engine of a chunk, given the opened study with the chunk's links and the materials for the trace."""
 
 _TRACING: Final = Lock()
-"""Lock that limits a process to tracing one chunk at a time."""
+"""Lock that lets a process trace only one chunk at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,10 +252,10 @@ class ChunkRecipe:
 
 @final
 class Chunk:
-    """Links that are traced and replayed together. Pickling a chunk sends its recipe instead of its paths.
+    """Links that are traced and replayed together. A pickled chunk contains its recipe instead of its paths.
 
     Attributes:
-        study: The opened study of the links.
+        study: The opened study with these links.
         engine: The engine for these links.
     """
 
@@ -265,7 +267,7 @@ class Chunk:
             self.engine = recipe.open(self.study, recipe.materials)
 
     def derived(self, make: Callable[[Chunk], Content]) -> Content:
-        """The result of `make` for this chunk, which is kept until the method is called with another function."""
+        """The result of `make` for this chunk; it is kept until this method is called with another function."""
         if self._derived is None or self._derived[0] != make:
             self._derived = None  # frees the memory first
             self._derived = make, make(self)
@@ -281,7 +283,7 @@ Derive = Callable[[Chunk], Differentiable]
 
 @final
 class ChunkedReplay:
-    """Replays links for any candidate, in chunks on workers; the constructor opens all chunks.
+    """Replays links in chunks on workers, for any candidate. The constructor opens all chunks.
 
     Args:
         workers: Workers that keep the chunks.
@@ -359,7 +361,7 @@ class ChunkedReplay:
         return of_links([part for _, part in answers], list(self.chunks))
 
     def ask(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Call a function on every chunk; see `Chunked.ask`."""
+        """Call a function for every chunk; see `Chunked.ask`."""
         return self._workers.ask(function, [self._kept], *arguments)
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
@@ -393,7 +395,7 @@ class ChunkedReplay:
         return zip(self.chunks, answers, strict=True)
 
 
-# Functions that are sent to the workers.
+# The functions below are sent to the workers.
 
 
 def _size(chunk: Chunk) -> tuple[int, bool]:

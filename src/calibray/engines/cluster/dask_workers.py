@@ -28,21 +28,21 @@ POLL: Final = 0.5
 """Interval between checks for dead workers [s]."""
 
 REPLACEMENT_WAIT: Final = 10.0
-"""Maximum time to wait for the replacement of a dead worker before other workers receive its chunks [s]."""
+"""Maximum time [s] to wait for the replacement of a dead worker before its chunks move to other workers."""
 
 NO_WORKER_WAIT: Final = 600.0
-"""Maximum time to wait for a new worker if no worker is left [s]."""
+"""Maximum time [s] to wait for a new worker when no worker is left."""
 
 MOST_DEATHS: Final = 4
-"""The run ends after this number of workers died on one chunk, because the chunk is probably too large."""
+"""Number of worker deaths on one chunk after which the run ends, because the chunk is probably too large."""
 
 FETCH_WAIT: Final = POLL
-"""Initial time to wait for the transfer of a finished answer [s]. This time doubles with every request, so that large
-answers eventually arrive. Dead workers are detected between requests.
+"""Initial time limit for the transfer of a finished answer [s]. The limit doubles with every request, so that even
+large answers eventually arrive. Dead workers are detected between requests.
 """
 
 Answered = Callable[[int], None]
-"""A function that is called with the number of a chunk after the chunk's answer has arrived."""
+"""A function that is called with the index of a chunk after the chunk's answer has arrived."""
 
 
 def count_death(deaths: Counter[int], chunk: int) -> None:
@@ -67,7 +67,8 @@ _LOG: Final = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class _KeptRemotely:
-    """Objects on workers: for each chunk, the worker that last made the object, and Dask's reference to the object."""
+    """Objects on workers, one per chunk: the address of the worker that last made the object, and Dask's reference to
+    it."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -111,7 +112,7 @@ class DaskWorkers:
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a function on the objects of every chunk; see `Workers.ask`."""
+        """Call a function for every chunk, with the objects kept for it; see `Workers.ask`."""
         handles = [handle for handle in kept if isinstance(handle, _KeptRemotely)]
         count = len(handles[0])
         self._assign_homes(range(count), self._living(at_least=1))
@@ -144,7 +145,7 @@ class DaskWorkers:
                 future = self._client.submit(handle.make, handle.sources[index], workers=[home], pure=False)
                 handle.objects[index] = home, future
         objects = (handle.objects[index][1] for handle in handles)
-        # With pure=True, Dask would return the earlier result of an equal call.
+        # With pure=True, Dask would return the stored result of an earlier identical call.
         return self._client.submit(function, *objects, *arguments, workers=[home], pure=False)
 
     def _wait_for_any(self, futures: list[Future]) -> None:
@@ -164,7 +165,7 @@ class DaskWorkers:
         except TimeoutError:
             return False
         except KilledWorker:
-            # The chunk's home is gone; `_move_from_dead` moves the chunk.
+            # The worker that held the chunk is gone; `_move_from_dead` moves the chunk.
             return False
         return True
 
@@ -202,7 +203,7 @@ class DaskWorkers:
                 load[self._homes[index]] += 1
 
     def _living(self, at_least: int = 0) -> list[str]:
-        """Return the addresses of the living workers; if too few are alive, wait for more.
+        """Return the addresses of the live workers, after waiting for more if there are too few.
 
         Raises:
             EngineError: No worker appeared within `NO_WORKER_WAIT`.
@@ -248,7 +249,7 @@ def _require_dask(option: str) -> None:
 
 
 def _wait_for_scheduler(scheduler: str) -> None:
-    """Wait until a program answers at an address; without this wait, Dask would log tracebacks.
+    """Wait until a program answers at an address, because Dask logs tracebacks if nothing answers.
 
     Raises:
         InputError: The address is malformed, or nothing answers at the address.

@@ -1,8 +1,8 @@
 """Workers, which keep chunks of links for replay and run the calls of an external program.
 
-Objects that are kept with a chunk are made on one worker and stay on this worker. Functions are sent to the worker,
-which returns only the results. Results are returned in the order of the chunk numbers, so sums over chunks do not
-depend on the workers.
+An object that is kept for a chunk is made on one worker and stays there. Functions are sent to this worker, which
+returns only their results. Results are returned in the order of the chunks, so sums over chunks do not depend on the
+workers.
 
 Workers on this machine are processes that communicate only through inherited pipes. No port is open, so no other user
 of the machine can send code to a worker or to the main process.
@@ -34,7 +34,7 @@ from calibray.support.memory import available_memory
 from calibray.support.messages import shortened
 
 ALWAYS_ALLOWED: Final = 8
-"""Number of worker processes that are allowed on any machine, even if the machine has few cores."""
+"""Number of worker processes that is always permitted, even on a machine with few cores."""
 
 END_WAIT: Final = 5.0
 """Maximum time to wait for a process to end before it is killed [s]."""
@@ -44,12 +44,12 @@ _NUMBER: Final = itertools.count()
 _CAN_PIN: Final = hasattr(os, "sched_setaffinity")
 
 ObjectKey = tuple[int, int]
-"""Number of a handle and number of a chunk, which together identify an object."""
+"""The number of a handle and the index of a chunk, which together identify an object."""
 
 
 @runtime_checkable
 class Workers(Protocol):
-    """Runs the work of an engine in this process, in processes on this machine, or on a Dask cluster."""
+    """Runs an engine's work in this process, in other processes on this machine, or on a Dask cluster."""
 
     def executor(self) -> Executor | None:
         """An executor for the calls of an external program; None to run them sequentially."""
@@ -69,10 +69,9 @@ class Workers(Protocol):
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a picklable function for every chunk, on the objects kept with it, and return the results by chunk.
-
-        The first arguments of the function are the objects, which `kept` identifies by their handles from `keep`. All
-        other arguments are the same for all chunks. `answered` is called with a chunk's number after its answer has
+        """Call a picklable function for every chunk, with the objects kept for it, and return the results by chunk. The
+        objects are the first arguments of the function; `kept` contains their handles, as returned by `keep`. All other
+        arguments are the same for all chunks. `answered` is called with a chunk's index after the chunk's answer has
         arrived.
 
         Raises:
@@ -85,9 +84,10 @@ class Workers(Protocol):
 class InProcess:
     """Runs the work in this process, one chunk at a time.
 
-    If `at_most` is given, at most this number of chunks is kept; the others are made again for each call. If `at_most`
-    is None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept until they
-    use a third of the memory that was free at the start, because objects derived from them need about the same amount.
+    If `at_most` is given, at most this many chunks are kept; the others are made again for each call. If `at_most` is
+    None and there is no cache folder, all chunks are kept. If there is a cache folder, chunks are kept until they use a
+    third of the memory that was free at the start, because the objects derived from the chunks need about as much
+    memory again.
     """
 
     def __init__(self, at_most: int | None = None) -> None:
@@ -120,7 +120,7 @@ class InProcess:
     def _has_room(self, kept: int) -> bool:
         if self._at_most is not None:
             return kept < self._at_most
-        # Without a cache folder, a chunk that is not kept must be traced again for each question.
+        # Without a cache folder, a chunk that is not kept would have to be traced again for each call.
         return cache_folder() is None or available_memory() > self._reserve
 
 
@@ -151,9 +151,9 @@ class _Question:
 
     Attributes:
         function: The function to call.
-        arguments: Arguments of the function after the objects.
-        keys: Keys of the objects that are the first arguments of the function.
-        recipes: Functions and sources from which the worker makes the objects that it does not have yet.
+        arguments: Arguments of the function that follow the objects.
+        keys: Keys of the objects that the function receives as its first arguments.
+        recipes: For each object that the worker does not have yet, the function that makes it and the source.
         handles: Handles that are still in use; objects of other handles are dropped.
     """
 
@@ -166,7 +166,7 @@ class _Question:
 
 @dataclass(eq=False)
 class _KeptInProcesses:
-    """Objects in worker processes, with one object per chunk."""
+    """Objects in worker processes, one per chunk."""
 
     make: Callable[[Any], Any]
     sources: list[Any]
@@ -190,7 +190,7 @@ class _Worker:
 class LocalWorkers:
     """Processes on this machine, started on first use, each with its share of the processor cores.
 
-    A chunk stays in one process. If a process dies, another process replaces it and makes the objects of its chunks
+    A chunk stays in one process. If a process dies, a new process replaces it and makes the objects of its chunks
     again. `open_executor` returns an executor for the calls of an external program.
     """
 
@@ -224,7 +224,7 @@ class LocalWorkers:
             try:
                 answers = self._ask(function, handles, arguments, answered)
             except BaseException:
-                # Other processes may still be sending answers to this question.
+                # Other workers may still be sending answers to this question.
                 self.close()
                 raise
         return [answers[index] for index in range(len(answers))]
@@ -238,8 +238,8 @@ class LocalWorkers:
     ) -> dict[int, Any]:
         self._start_all()
         count, answers = len(handles[0]), {}
-        # A chunk's number determines its worker, so that the worker already has the chunk's objects at the next
-        # question.
+        # A chunk's index determines its worker, so that the worker already has the chunk's objects when the next
+        # question arrives.
         waiting = [list(range(home, count, self._count))[::-1] for home in range(self._count)]
         while len(answers) < count:
             for home, worker in enumerate(self._workers):
@@ -313,7 +313,7 @@ class LocalWorkers:
             for key, handle in zip(keys, handles, strict=True)
             if key not in worker.objects
         }
-        # The objects that the worker has after this question; the worker drops objects whose handles are no longer in
+        # The objects that the worker will hold after this question; it drops objects whose handles are no longer in
         # use.
         worker.objects = {key for key in worker.objects if key[0] in alive} | set(keys)
         return _Question(function, arguments, keys, recipes, alive)
@@ -324,7 +324,8 @@ class LocalWorkers:
             worker.pipe.send_bytes(content)
 
     def _receive(self) -> list[tuple[int, tuple[Any, Exception | None] | None]]:
-        """The received answers, each with the number of its worker; the answer of a worker that died is None."""
+        """The answers received so far, each preceded by its worker's index; None as the answer means that the worker
+        died."""
         homes = {worker.pipe: home for home, worker in enumerate(self._workers)}
         answers: list[tuple[int, tuple[Any, Exception | None] | None]] = []
         for pipe in cast(list[Connection], wait(list(homes), POLL)):
@@ -397,10 +398,10 @@ def _pin(home: int, count: int) -> None:
 
 
 def check_workers(workers: object) -> None:
-    """Refuse anything but workers or None.
+    """Refuse any argument other than workers or None.
 
     Raises:
-        InputError: The argument is of another type, such as a number.
+        InputError: The argument is neither workers nor None, but for example a number.
     """
     if not isinstance(workers, Workers | None):
         raise InputError(
@@ -413,10 +414,10 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
     """Open workers for `engines.make`, `calibrate`, `validate` and predictions, and close them at the end.
 
     Args:
-        workers: Number of workers on this machine: processes that keep chunks of links, or external programs that run
-            in parallel.
-        scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". The workers of the scheduler need
-            Calibray, and access to the study's folder under the same path.
+        workers: Number of workers on this machine, which are processes that keep chunks of links or external programs
+            that run in parallel.
+        scheduler: Address of a Dask scheduler, for instance "tcp://10.0.0.1:8786". The scheduler's workers need an
+            installation of Calibray and access to the study's folder under the same path.
 
     Yields:
         The workers; None if neither argument is given.

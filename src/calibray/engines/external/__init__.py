@@ -1,1 +1,1 @@
-"""External programs as engines: the files exchanged with a program, and the calls that run it."""
+"""External programs as engines: the files exchanged with a program, and the calls of the program."""

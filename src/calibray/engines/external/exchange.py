@@ -31,7 +31,7 @@ RESPONSE: Final = "the response"
 """Name of the response in messages."""
 
 RAY_COLUMNS: Final = ("path", "point")
-"""Columns that a ray table has and a response with path loss does not have."""
+"""Columns that distinguish a ray table from a response with path loss."""
 PATH_LOSS_DB: Final = (20.0, 300.0)  # range of plausible path loss [dB]
 RESPONSE_BYTES: Final = (
     16 << 20,
@@ -45,21 +45,22 @@ _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
 class Unusable(ValueError):
-    """The answer is missing or malformed, has the wrong length, or is not a number."""
+    """The response is missing or malformed, has the wrong length, or contains a value that is not a number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """One RT call in the form that is sent to a program.
+    """One RT call, as sent to a program.
 
     Attributes:
         radio: Carrier, bandwidth, combining and antennas.
         tx: Transmitter position of every link [L, 3], [m].
         rx: Receiver position of every link [L, 3], [m].
-        materials: All materials of the scene with the candidate's values at the study's carrier, by name.
+        materials: All materials of the scene by name, with the candidate's values at the study's carrier.
         parameters: The candidate's values by parameter name, in the parameters' units.
         link_frequency: Carrier of every link [L], [Hz]; None if all links have the study's carrier.
-        carriers: The materials at each carrier of the links [Hz]; empty if all links have the study's carrier.
+        carriers: For each carrier [Hz] of the links, the materials at this carrier; empty if all links have the study's
+            carrier.
     """
 
     radio: RadioSettings
@@ -91,8 +92,8 @@ class Request:
         return [wanted.record() for wanted in self.radio.observables]
 
     def _json(self) -> dict[str, Any]:
-        # Materials and parameters are written as lists, because MATLAB turns the keys of an object into identifiers and
-        # would garble names such as "walls.relative_permittivity".
+        # Materials and parameters are written as lists, because MATLAB converts the keys of an object to identifiers,
+        # which would alter names such as "walls.relative_permittivity".
         links = {"tx": self.tx.tolist(), "rx": self.rx.tolist()}
         if self.link_frequency is not None:
             links["frequency"] = self.link_frequency.tolist()
@@ -149,7 +150,7 @@ def read_answer(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read a program's response: path loss [L], [dB], and further observables [K, L] in their own units.
 
-    Path loss is +inf for a link without a path; an observable is NaN for a link without a value.
+    For a link without a path, path loss is +inf; for a link without a value, an observable is NaN.
 
     Raises:
         Unusable: The file is missing or malformed, or does not contain one number per link.
@@ -211,7 +212,8 @@ def read_rays(path: Path, num_links: int) -> bytes:
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
-    """The bytes of a response. Only a regular file is read, because a program can leave anything at the path."""
+    """The bytes of a response. Only a regular file is read, because a program can create any type of file at this
+    path."""
     try:
         # With O_NOFOLLOW, `open` does not follow a link; with O_NONBLOCK, `open` does not wait for the writer of a
         # FIFO.
@@ -256,7 +258,7 @@ def _read_json(response: bytes, name: str, _: int) -> NDArray[np.float64]:
 
 
 def _rays_hint(names: Any) -> str:
-    """The remedy if a response with these names is a ray table; otherwise an empty string."""
+    """The remedy to append to a message if a response with these columns is a ray table; otherwise an empty string."""
     is_table = isinstance(names, dict | list) and all(name in names for name in RAY_COLUMNS)
     return "; the response is a ray table: set rays = true in [engine]" if is_table else ""
 

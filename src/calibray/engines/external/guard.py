@@ -1,8 +1,10 @@
-"""The guard runs an external program, limits its output, and finally kills all processes that the program started.
+"""The guard runs an external program, limits the output that it keeps, and at the end kills all processes that the
+program started.
 
 The guard is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of
-Calibray. The guard runs as a process between Calibray and the program for two reasons. First, on Linux the guard adopts
-orphaned processes (PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's process group and session.
+Calibray. There are two reasons to run the guard as a process between Calibray and the program. First, on Linux the
+guard adopts orphaned processes (PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's process group
+and session.
 Second, the guard outlives Calibray: when its standard input ends because Calibray ended or stopped the call, the guard
 kills the program and removes the folder.
 
@@ -33,7 +35,7 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 
 
 class Output:
-    """The beginning and the end of a stream of any length."""
+    """Keeps the beginning and the end of a stream of any length."""
 
     def __init__(self) -> None:
         self.head, self.tail, self.length = b"", b"", 0
@@ -86,7 +88,8 @@ def main(timeout: float, words: list[str]) -> dict[str, object]:
 
 
 def _prctl():
-    """The system call that makes a process adopt orphans or die with its parent; a dummy function except on Linux."""
+    """The system call that makes a process adopt orphans or die with its parent; on systems other than Linux, a
+    function without effect."""
     if sys.platform != "linux":
         return lambda option, value: None
     library = ctypes.CDLL(None)
@@ -129,7 +132,7 @@ def _listen(process: subprocess.Popen, deadline: float, signals: int, outputs: d
 
 def _kill_tree(process: subprocess.Popen) -> None:
     """Kill the program's process group, and then all descendants of the guard until none is left."""
-    # On Linux, the guard adopts orphans; elsewhere, orphans are found only if they are listed before their parent ends.
+    # On Linux, the guard adopts orphans; elsewhere, an orphan is found only if it was listed before its parent ended.
     adopts = sys.platform == "linux"
     if adopts:
         _kill_group(process)
@@ -146,7 +149,7 @@ def _kill_tree(process: subprocess.Popen) -> None:
             with suppress(psutil.Error):
                 descendant.kill()
         psutil.wait_procs(descendants, timeout=0.01)
-        # In the meantime, processes may have started others, and the guard has adopted the children of the killed
+        # In the meantime, further processes may have been started, and the guard has adopted the children of the killed
         # processes.
         descendants = guard.children(recursive=True)
 
@@ -167,7 +170,7 @@ def _has_child() -> bool:
 
 
 def _drain(reader: int, output: Output) -> None:
-    """Read the remaining content of a pipe, even if another process still has its other end open."""
+    """Read what remains in a pipe, even if another process still has the pipe's other end open."""
     os.set_blocking(reader, False)
     with suppress(BlockingIOError):
         while part := os.read(reader, 1 << 16):

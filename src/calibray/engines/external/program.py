@@ -42,7 +42,7 @@ GUARD: Final = (
 
 
 Response = tuple[NDArray[np.float64], NDArray[np.float64]] | bytes
-"""Either path loss [L], [dB], and further observables [K, L] in SI units, or a ray table."""
+"""The content of a response: either path loss [L], [dB], and further observables [K, L] in SI units, or a ray table."""
 
 
 class Unstartable(Unusable):
@@ -50,7 +50,7 @@ class Unstartable(Unusable):
 
 
 class Lost(Unusable):
-    """The guard of the program ended, which is not the program's fault."""
+    """The guard ended unexpectedly, which is not the program's fault."""
 
 
 class Stopped(Exception):
@@ -59,12 +59,12 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Outcome of all attempts to run the program for one candidate.
+    """Outcome of a program's call for one candidate, after all attempts.
 
     Attributes:
-        path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for all links if all attempts failed.
+        path_loss_db: Path loss [L], [dB]; +inf for a link without a path, and for every link if all attempts failed.
         seconds: Total duration of all attempts [s].
-        failure: Error of the last attempt; empty if it succeeded.
+        failure: Error message of the last attempt; empty if this attempt succeeded.
         rays: The response of a program that returns rays; otherwise further observables [K, L] in SI units as
             little-endian doubles, or empty.
         lost: Whether the last attempt failed because a worker or the guard ended, which is not the program's fault.
@@ -79,11 +79,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """An external program with the settings of its calls; picklable, for calls on other machines.
+    """An external program with the settings of its calls; picklable, so that other machines can call it.
 
     Attributes:
         words: The program and its arguments. The file paths replace the placeholders `{request}` and `{response}`; a
-            path without a placeholder is appended.
+            path whose placeholder is missing is appended.
         folder: Folder in which the program runs.
         timeout: Time limit for one attempt [s].
         retries: Number of further attempts after a failure.
@@ -110,13 +110,13 @@ class ExternalProgram:
                 )
 
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
-        """Call the program for one candidate; after a failure, call it again until no attempts are left.
+        """Call the program for one candidate, and repeat a failed call until no attempts are left.
 
-        A failure is returned instead of raised, so that only one candidate is lost and not the whole batch. Another
+        A failure is returned rather than raised, so that only one candidate is lost instead of the whole batch. Another
         thread can set `stop` to kill the program.
 
         Raises:
-            Stopped: `stop` was set before the program answered.
+            Stopped: `stop` was set before the program had answered.
             EngineError: The files cannot be written, which is not the program's fault.
         """
         num_links = len(request.tx)
@@ -220,7 +220,7 @@ class ExternalProgram:
 
 
 def _last_report(guard: subprocess.Popen) -> bytes:
-    """The report of a guard whose standard input was closed; before it reports, the guard kills its program."""
+    """The report of a guard whose standard input has been closed; the guard kills its program before it reports."""
     try:
         return guard.communicate(timeout=GUARD_WAIT)[0]
     except subprocess.TimeoutExpired:
@@ -239,7 +239,8 @@ def _describe_status(status: int) -> str:
 
 @contextmanager
 def _call_folder() -> Iterator[Path]:
-    """A temporary folder for one call, with a file that names the owner; folders whose owner has ended are removed."""
+    """A temporary folder for one call, with a file that identifies its owner; folders whose owner has ended are
+    removed."""
     try:
         parent = Path(tempfile.gettempdir())
         _remove_abandoned(parent)

@@ -1,4 +1,4 @@
-"""The kinds of engines, one per module; a new module in this folder adds a kind and its study section."""
+"""The kinds of engines, one per module. A new module in this folder adds a kind of engine and its study section."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibray.engines.section import EngineSection
 
 
 def _sections() -> dict[str, type[EngineSection]]:
-    """The sections defined by the modules in this folder, by name."""
+    """The engine sections that the modules in this folder define, by name."""
     modules = [import_module(f"{__name__}.{entry.name}") for entry in iter_modules(__path__)]
     sections = [
         value
@@ -43,4 +43,4 @@ if TYPE_CHECKING:
     AnyEngine = EngineSection
 else:
     AnyEngine = Annotated[reduce(or_, KINDS.values()), Field(discriminator="name")]
-"""The section of any kind of engine; the key `name` determines the kind."""
+"""The section of any kind of engine; its key `name` determines the kind."""

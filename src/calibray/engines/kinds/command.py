@@ -1,4 +1,4 @@
-"""Command: an external program computes path loss for candidates, sequentially or in parallel."""
+"""Command: an external program computes the path loss of candidates, one after another or in parallel."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ class CommandSection(EngineSection):
         return self
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
-        """The command line, and "rays" if the program returns rays; the version of the program is unknown."""
+        """The command line, followed by "rays" if the program returns rays; the program's version is unknown."""
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
-        """SHA-256 by name of the files that are named on the command line and are in the study's folder."""
+        """SHA-256 of each file, by name, that the command line names and that lies in the study's folder."""
         folder = study.source.resolve().parent
         files = {word: folder / word for word in self.command if exists(folder / word)}
         return {word: file_digest(file) for word, file in files.items() if file.is_relative_to(folder)}
@@ -93,9 +93,9 @@ _LOG: Final = logging.getLogger(__name__)
 class Command:
     """An external program, called once for every candidate.
 
-    If all attempts of a call fail, only its candidate is lost: for this candidate, all links count as links without a
+    If all attempts of a call fail, only the candidate of this call is lost: all its links count as links without a
     path. The run ends if every candidate of the first batch fails or if `give_up_after` successive calls fail, because
-    the program is then probably at fault.
+    the program itself is then probably at fault.
 
     Args:
         program: The program, with the settings of its calls.
@@ -123,7 +123,7 @@ class Command:
         self._successive_failures, self._give_up_after = 0, give_up_after
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the program's answers; see `Answering`."""
+        """Path loss of every link for candidates, as answered by the program; see `Answering`."""
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
@@ -131,7 +131,7 @@ class Command:
     def respond(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool = False
     ) -> Responses:
-        """Path loss and further observables of every link, from the program's answers; see `Observing.respond`.
+        """Path loss and further observables of every link, as answered by the program; see `Observing.respond`.
 
         Raises:
             InputError: The program does not compute these observables, or derivatives are requested.
@@ -148,7 +148,7 @@ class Command:
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Yield the answer to each candidate as soon as its call ends; see `Answering.answers`."""
         if not self.calls:
-            # A study may come from someone else, so the user must see which program it runs on this machine.
+            # The study may come from someone else, so the user must see which program it runs on this machine.
             _LOG.warning(
                 "%s runs a program in %s: %s", printable(str(self._source)), printable(str(self._program.folder)),
                 printable(shlex.join(self._program.words)),
@@ -177,7 +177,7 @@ class Command:
                 )
 
     def _with_path_loss(self, outcome: Outcome) -> Outcome:
-        """The outcome, with the path loss computed from its rays or with the error that the rays caused."""
+        """The outcome, completed by the path loss computed from its rays, or by the error if the rays are unusable."""
         from calibray.engines.rays.export import Export
 
         try:
@@ -219,13 +219,13 @@ class Command:
             interruption = error
             acknowledge_interruption()
         finally:
-            # If all calls have ended, `stop` remains unset, so the caller can still wait for the answers of another
-            # run.
+            # If all calls have ended, `stop` remains unset, so that the caller can still wait for the answers of
+            # another run.
             if pending:
                 stop.set()
             for future in pending:
                 future.cancel()
-        # Answers of calls that have already ended are yielded before the run ends, so that they are not lost.
+        # Before the run ends, the answers of calls that have already ended are yielded, so that they are not lost.
         for future in wait(pending, None if local_stop else 0).done:
             if not future.cancelled() and not future.exception():
                 yield pending[future], future.result()

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _LOG: Final = logging.getLogger(__name__)
 
 DISPLACED: Final = ("height", "dx", "dy")
-"""Values of `field` for parameters that displace antennas."""
+"""Values of a parameter's `field` for parameters that displace antennas."""
 
 
 @final
@@ -35,12 +35,12 @@ class ReplaySection(EngineSection):
 
     Attributes:
         name: "replay".
-        compress_db: Maximum error in path loss when a few weighted paths replace all paths [dB]; None to replay all
+        compress_db: Maximum error in path loss [dB] when a few weighted paths replace all paths; None to replay all
             paths.
         chunk_links: Maximum number of links that are traced and replayed together. If None, all links are traced
-            together unless workers are given. With workers, the maximum is `chunks.CHUNK_LINKS`, or more if there would
-            otherwise be more than `chunks.MOST_CHUNKS` chunks.
-        rays: Ray table with the paths of another engine, which replaces the trace.
+            together unless workers are given. With workers, the default is `chunks.CHUNK_LINKS`, raised where necessary
+            to keep the number of chunks at or below `chunks.MOST_CHUNKS`.
+        rays: Ray table with the paths of another engine, which are used instead of traced paths.
     """
 
     expensive: ClassVar[bool] = False
@@ -65,7 +65,7 @@ class ReplaySection(EngineSection):
         Raises:
             InputError: The study does not allow compression, or its links cannot be traced.
         """
-        # A study that does not allow compression is refused before anything is traced.
+        # If the study does not allow compression, it is refused before anything is traced.
         self._check_compressible(study)
         if paths is None and (workers is not None or self.chunk_links is not None):
             return self._chunked(study, progress, workers)
@@ -107,14 +107,14 @@ class ReplaySection(EngineSection):
 def trace_and_replay(
     compress_db: float | None, study: OpenedStudy, materials: Mapping[str, Material]
 ) -> Replay | ReplayCarriers:
-    """The replay of a chunk's links with paths traced with the given materials; picklable, for use on workers."""
+    """The replay of a chunk's links, whose paths are traced with the given materials; picklable, for use on workers."""
     return replay(study, study.trace(materials), compress_db)
 
 
 def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
-    """The replay of an opened study with stored paths, using one program per carrier.
+    """The replay of an opened study from stored paths, with one program per carrier.
 
-    `compress_db` is the maximum error in path loss when a few weighted paths replace all paths [dB]; None keeps all
+    `compress_db` is the maximum error in path loss [dB] when a few weighted paths replace all paths; None keeps all
     paths.
     """
     from calibray.engines.compression import compress

@@ -1,4 +1,4 @@
-"""Re-trace: the ray tracer runs again for every candidate, as in the paper."""
+"""Retrace: the ray tracer runs again for every candidate, as in the paper."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class CarrierTracer:
     """The ray tracer at one carrier.
 
     Attributes:
-        tracer: The ray tracer with its scene, whose materials have their constants at this carrier before calibration.
+        tracer: The ray tracer with its scene, whose materials have their uncalibrated constants at this carrier.
         links: The links measured at this carrier.
         index: Indices of these links among all links [l].
     """
@@ -97,7 +97,7 @@ class Retrace:
         self._combining, self._bandwidth = combining, bandwidth
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, which are traced one by one; see `Engine.path_loss`."""
+        """Path loss of every link for candidates, which are traced one after another; see `Engine.path_loss`."""
         values = check_candidates(candidates, len(self.parameters))
         return np.stack([answer.path_loss_db for answer in self.answers(values)])
 

@@ -1,11 +1,11 @@
-"""The SQLite file of a ledger: tables, transactions, errors, and entries whose digest reveals damage.
+"""The SQLite file of a ledger: tables, transactions, errors, and entries with digests that reveal damage.
 
 A rescue file is written next to the ledger. If the ledger's folder is missing or full, the rescue file is written to
 the user's state folder or the temporary folder. The next run with the same ledger reads the rescue file.
 
-A claim states which run computes a candidate, so that two runs with one ledger do not compute the same candidate. A
-claim is valid as long as its run renews it. A claim ends immediately if the process of its run is known to have ended.
-Each run times the renewals of other runs with its own clock, because the clocks of two machines can differ by hours.
+A claim states which run computes a candidate, so that two runs with the same ledger do not compute it twice. A
+claim is valid as long as its run renews it. A claim ends immediately if its run's process is known to have ended. Each
+run times the renewals of other runs by its own clock, because the clocks of two machines can differ by hours.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ SKEW: Final = 86_400.0  # maximum accepted difference between the clocks of two 
 RENEWAL: Final = EXPIRY / 5  # interval between renewals [s]; a few renewals may fail
 _active_runs: set[str] = set()  # the runs of this process
 _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
-"""For each claim of another run: its latest value of `expires`, and the time of its last change on the clock of this
-process [s]."""
+"""For each claim of another run, the latest value of `expires` and the time [s] at which this value last changed, by
+the clock of this process."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
-    """Claim candidates within the caller's transaction, and return the candidates that no other run has claimed."""
+    """Claim the candidates that no other run has claimed, within the caller's transaction, and return them."""
     now, owner = time.time(), json.dumps(ProcessOwner.current().record())
     _active_runs.add(run)
     claimed = []
@@ -71,11 +71,11 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
 def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
     """Whether a claim of another run is still valid.
 
-    A claim is invalid if its process has ended, or has not renewed the claim for a time of `EXPIRY`. `expires` and
-    `now` are times [s since 1970] on the clocks of the claim's machine and of this machine.
+    A claim is invalid if its process has ended or has not renewed the claim for the duration `EXPIRY`. `expires` and
+    `now` are times [s since 1970] by the clocks of the claim's machine and of this machine, respectively.
     """
-    # A clock may be wrong by `SKEW`; a claim is damaged or abandoned if its expiry differs by more from the present
-    # time.
+    # A clock may be wrong by up to `SKEW`. If a claim's expiry is further than this from the present time, the claim is
+    # damaged or abandoned.
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
     try:
@@ -94,7 +94,7 @@ def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, n
 
 
 def release(connection: sqlite3.Connection, run: str) -> None:
-    """Release all claims of a run; if the ledger cannot be written, the claims end with the process."""
+    """Release all claims of a run. If the ledger cannot be written, the claims become invalid when the process ends."""
     _active_runs.discard(run)
     with suppress(sqlite3.Error):
         (timeout,) = connection.execute("PRAGMA busy_timeout").fetchone()
@@ -120,7 +120,7 @@ def renewing(file: Path, run: str) -> Iterator[None]:
 
 def _renew(file: Path, run: str, ended: Event) -> None:
     while not ended.wait(RENEWAL):
-        # If the ledger cannot be written, storing the engine's next answer fails and reports the error.
+        # If the ledger cannot be written, the attempt to store the engine's next answer will report the error.
         with (
             suppress(sqlite3.Error),
             closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True, isolation_level=None)) as ledger,
@@ -129,7 +129,7 @@ def _renew(file: Path, run: str, ended: Event) -> None:
 
 
 RANGE_DB: Final = (-100.0, 10_000.0)
-"""Range of path loss that every engine respects [dB]; values outside this range indicate damage."""
+"""Range of path loss [dB] that no engine's answer exceeds; values outside this range indicate damage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ class LedgerEntry:
 
     @property
     def fault(self) -> str:
-        """The reason why no engine can have returned this answer; empty if the answer is possible."""
+        """The reason why this answer cannot come from an engine; empty if it can."""
         values, (lower, upper) = self.path_loss_db, RANGE_DB
         outside = ~((values >= lower) & (values <= upper) | np.isposinf(values))
         if outside.any():
@@ -219,7 +219,7 @@ _COLUMNS: Final = {
 
 
 def check_own_file(path: Path) -> None:
-    """Refuse a ledger path that leads to another file, because SQLite would write to that file.
+    """Refuse a ledger path through which SQLite would write to another file.
 
     Raises:
         InputError: The file, or a file that SQLite keeps next to the ledger, is a link, a folder, a device or a FIFO,
@@ -317,7 +317,7 @@ def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    """Commit several statements together, or none of them."""
+    """Commit several statements together; if one fails, commit none of them."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield
@@ -331,7 +331,7 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 def explain(error: sqlite3.Error | OSError) -> str:
     """The text of a ledger error, followed by a remedy."""
-    # The lowest byte is the kind of error; the others are details.
+    # The lowest byte of the code states the type of error; the other bytes state details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
     damaged = "move the ledger away and start again, or recover its contents with `sqlite3 FILE .recover`"
     end_program = "end that program and start again"
@@ -374,12 +374,13 @@ def write_rescue_file(ledger: Path, fill: Callable[[sqlite3.Connection], None]) 
 
 
 def rescue_files(ledger: Path) -> Iterator[Path]:
-    """The rescue files of a ledger; a damaged file is renamed with a warning."""
+    """The rescue files of a ledger; damaged files are renamed, with a warning."""
     for folder, prefix in _folders(ledger):
         for file in sorted(folder.glob(f"{prefix}*{SUFFIX}")):
             try:
                 status = file.lstat()
-                # All users can write to the temporary folder, so a file of another user must not be accepted.
+                # All users can write to the temporary folder, so a file that belongs to another user must not be
+                # accepted.
                 if not stat.S_ISREG(status.st_mode) or (
                     folder != ledger.parent and status.st_uid != os.geteuid()
                 ):
@@ -399,7 +400,7 @@ def rescue_files(ledger: Path) -> Iterator[Path]:
 
 
 def _folders(ledger: Path) -> Iterator[tuple[Path, str]]:
-    """Folders for rescue files, and the prefix of the ledger's files in each folder."""
+    """The folders for a ledger's rescue files, each with the prefix that the names of these files have there."""
     yield ledger.parent, PREFIX
     prefix = f"{PREFIX}{hashlib.sha256(str(ledger).encode()).hexdigest()[:16]}-"
     state = user_state_path("calibray", appauthor=False)

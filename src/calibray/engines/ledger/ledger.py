@@ -1,8 +1,8 @@
 """The ledger stores every completed RT call in one SQLite file.
 
-Each answer is committed before the optimizer receives it, so a killed run finds its answers when it is started again.
-Several runs can write to one ledger at the same time. The ledger must be on a local disk, because SQLite's write-ahead
-log requires a local disk. Answers that the ledger cannot store are written to a rescue file (see `Ledger.rescue`).
+Each answer is committed before the optimizer receives it, so that a killed run finds all its answers when it is
+restarted. Several runs can write to one ledger at the same time. The ledger must be on a local disk, as SQLite's
+write-ahead log requires. Answers that the ledger cannot store are written to a rescue file (see `Ledger.rescue`).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Ledger:
     """Stored RT calls by problem and candidate.
 
     Args:
-        path: The SQLite file, which is created with its folder if it does not exist. A file that cannot be written is
-            opened read-only.
+        path: The SQLite file; if it does not exist, it is created, together with its folder. A file that cannot be
+            written is opened read-only.
 
     Attributes:
         read_only: Whether the file cannot be written.
@@ -59,7 +59,7 @@ class Ledger:
             database.check_own_file(self.path)
             self._connection = self._connect()
             try:
-                # SQLite opens the file by name, so the file may have been replaced in the meantime.
+                # SQLite opens the file by name, so the file may have been replaced since the check.
                 database.check_own_file(self.path)
                 database.set_up(self._connection, self.path)
                 self._file = _identity(self.path)
@@ -119,7 +119,7 @@ class Ledger:
             database.insert_problem(self._connection, problem, engine, parameters)
 
     def changed_program_files(self, problem: str, files: Mapping[str, str]) -> list[str]:
-        """Names of a program's files that have changed since the program's calls were stored.
+        """Names of those files of a program that have changed since the program's calls were stored.
 
         `files` contains the current files with their digests. If the problem has no stored calls, the current digests
         are stored.
@@ -137,7 +137,7 @@ class Ledger:
         return [name for name, digest in files.items() if earlier.get(name, digest) != digest]
 
     def find(self, problem: str, candidate: bytes, num_links: int) -> database.LedgerEntry | None:
-        """The entry of a candidate; None if there is no entry. A damaged entry is deleted with a warning.
+        """The entry of a candidate; None if there is no entry. A damaged entry is deleted, with a warning.
 
         Raises:
             EngineError: The ledger cannot be read.
@@ -161,7 +161,8 @@ class Ledger:
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
-        """Claim the candidates that this run will compute; `commit` and the end of `working` release the claims.
+        """Claim the candidates that this run will compute. The claims are released by `commit` and at the end of
+        `working`.
 
         Returns the candidates that have no answer and are not claimed by another run.
 
@@ -191,10 +192,10 @@ class Ledger:
             database.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: database.LedgerEntry) -> database.LedgerEntry:
-        """Write an entry, unless another run has already written an entry; return the stored entry.
+        """Write the entry of a candidate, unless another run has already written one; return the stored entry.
 
         Raises:
-            EngineError: The ledger cannot store the entry; `rescue` can write it to a file.
+            EngineError: The ledger cannot store the entry; `rescue` can write the entry to a rescue file.
         """
         with self._errors(), database.transaction(self._connection):
             earlier = self.find(problem, candidate, len(entry.path_loss_db))
@@ -213,7 +214,8 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, database.LedgerEntry]],
     ) -> str:
-        """Write answers that were not stored in the ledger to a rescue file, and return a sentence with its path."""
+        """Write the answers that the ledger could not store to a rescue file, and return a sentence that states the
+        file's path."""
 
         def fill(connection: sqlite3.Connection) -> None:
             database.set_up(connection, self.path)
@@ -225,7 +227,8 @@ class Ledger:
         return _describe_rescue(database.write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete the failed calls of one problem or of all problems, so that they are run again; return their number.
+        """Delete the failed calls of one problem or of all problems, so that they are run again; return how many were
+        deleted.
 
         Raises:
             InputError: The ledger is read-only.
@@ -239,7 +242,7 @@ class Ledger:
             ).rowcount
 
     def table(self, path_loss: bool = False) -> pd.DataFrame:
-        """All RT calls in the order in which they were committed; damaged calls are omitted with a warning.
+        """All RT calls in the order in which they were committed; damaged calls are omitted, with a warning.
 
         The columns are `problem` (the start of the problem's fingerprint), `engine`, `time`, `seconds`, `status` ("ok"
         or "failed"), `message` and one column per parameter. With `path_loss`, there is also one column per link:
@@ -281,11 +284,11 @@ class Ledger:
             raise EngineError(f"{self.path}: the ledger cannot be used ({database.explain(error)})") from None
 
     def _check_identity(self) -> None:
-        """Rescue all answers and end the run if the file was removed or replaced."""
+        """If the file was removed or replaced, rescue all answers and end the run."""
         if self.read_only or _identity(self.path) == self._file:
             return
         with self._errors():
-            # A removed file can still be read as long as it is open.
+            # A file that was removed can still be read while it is open.
             (count,) = self._connection.execute("SELECT COUNT(*) FROM answers").fetchone()
             rescued = _describe_rescue(database.write_rescue_file(self.path, self._connection.backup), count)
         raise EngineError(f"{self.path}: was removed or replaced during the run; {rescued}")
@@ -306,7 +309,7 @@ def open_ledger(folder: str | Path) -> Ledger:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and inode of the file at a path."""
+    """Device number and inode of the file at a path."""
     try:
         status = path.lstat()
     except OSError:

@@ -31,16 +31,16 @@ LONGEST_WAIT: Final = 1.0
 
 @final
 class Recorded:
-    """An engine with a ledger, so that a candidate that any run has completed is not run again.
+    """An engine with a ledger, so that a candidate completed by any run is not run again.
 
     Args:
         engine: The engine.
         ledger: The ledger.
         problem: Fingerprint of everything that determines the engine's answers, except the candidate.
         name: Name of the engine.
-        progress: Called with "waiting", the number of answers received from other runs, and the number of awaited
-            answers.
-        program_files: SHA-256 of the files of the engine's program by name, if the program has files.
+        progress: Called with "waiting", the number of answers received from other runs, and the total number of answers
+            expected from them.
+        program_files: SHA-256, by file name, of the files of the engine's program; empty if there are none.
 
     Attributes:
         hits: Number of candidates so far that required no RT call, because the candidate was in the ledger or occurred
@@ -82,7 +82,8 @@ class Recorded:
         return self._engine.materials
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the ledger or else from the engine; see `Answering`."""
+        """Path loss of every link for candidates, from the ledger if stored there, otherwise from the engine; see
+        `Answering`."""
         answers, first = self._all_answers(candidates)
         return gather(answers, (len(candidates), self._engine.num_links), first)
 
@@ -102,7 +103,7 @@ class Recorded:
         return gather_responses(answers, (len(candidates), self._engine.num_links), len(wanted), first)
 
     def _all_answers(self, candidates: NDArray[np.float64]) -> tuple[list[Answer], bool]:
-        """The answers for candidates, and whether these candidates are the first batch."""
+        """The answers to candidates, and whether these candidates are the first batch."""
         first = self.calls + self.hits == 0
         answers = list(self.answers(check_candidates(candidates, len(self.parameters))))
         failures = [answer.failure for answer in answers if answer.failure]
@@ -118,12 +119,13 @@ class Recorded:
         return answers, first
 
     def forget_failures(self) -> None:
-        """Delete the failed calls of the problem if the ledger can be written, so that the next run repeats them."""
+        """If the ledger can be written, delete the failed calls of the problem, so that the next run repeats them."""
         if not self._ledger.read_only:
             self._ledger.forget_failures(self._problem)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Yield answers from the ledger, or else from the engine, until `stop` is set; see `Answering.answers`."""
+        """Yield answers, from the ledger if stored there and otherwise from the engine, until `stop` is set; see
+        `Answering.answers`."""
         values, stop = candidates, stop or Event()
         self._warn_of_changed_files()
         # A candidate that occurs several times in one batch is run only once.
@@ -151,7 +153,8 @@ class Recorded:
                 pause = min(2 * pause, LONGEST_WAIT)
 
     def _warn_of_changed_files(self) -> None:
-        """Before the first answer, warn if the program's files have changed since the calls in the ledger."""
+        """Before the first answer, warn if the program's files have changed since the calls in the ledger were
+        stored."""
         files, self._unchecked_files = self._unchecked_files, {}
         if files and (changed := self._ledger.changed_program_files(self._problem, files)):
             _LOG.warning(
@@ -185,7 +188,7 @@ class Recorded:
                 try:
                     entry = self._ledger.commit(self._problem, candidate, entry)
                 except (EngineError, KeyboardInterrupt) as error:
-                    # Before the run ends, collect the answers of calls in progress, so that these answers are not lost.
+                    # Before the run ends, collect the answers of the calls in progress, so that they are not lost.
                     stop.set()
                     unsaved = [(candidate, entry)]
                     with suppress(EngineError):
@@ -198,7 +201,7 @@ class Recorded:
                         raise
                     rescued = self._ledger.rescue(self._problem, self._name, self.parameters.names, unsaved)
                     raise EngineError(f"{error}. {rescued}") from None
-                # The candidate itself required an RT call; its repeats in the batch did not.
+                # The first occurrence of the candidate required an RT call; its repetitions in the batch did not.
                 self.hits += len(indices[candidate]) - 1
                 yield from (_answer(index, entry) for index in indices[candidate])
 
