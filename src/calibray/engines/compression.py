@@ -127,8 +127,7 @@ def compress(paths: Paths, parameters: Parameters, tolerance_db: float = TOLERAN
 
 
 def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
-    """Omit the weakest paths of every link, so that the omitted paths together carry at most `share` of the link's
-    power.
+    """Omit the weakest paths of every link, which together carry at most `share` of the link's power.
 
     A path's shares of the power are summed over candidates spread over the parameters' bounds, so the omitted paths
     carry at most `share` of the power at each of these candidates. The returned program is valid for sums of powers.
@@ -190,8 +189,7 @@ def _evaluate_all(
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of the paths in the fits, in ascending order: for every link with many paths, the strongest and some
-    random paths."""
+    """Ascending indices of the paths in the fits: of links with many paths, the strongest and some random ones."""
     random, pool = np.random.default_rng(0), []
     for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
         if len(of_link) > MIN_PATHS:

@@ -1,5 +1,4 @@
-"""Identity of the process that owns a claim or a temporary folder, with which other processes check whether it is still
-alive."""
+"""The process that owns a claim or a temporary folder, and the check whether this process is still alive."""
 
 from __future__ import annotations
 
@@ -15,8 +14,8 @@ import psutil
 CLOCK_TOLERANCE: Final = 2.0
 """Maximum accepted difference [s] between two readings of a process's start time.
 
-A start time relative to 1970 changes if the system clock is corrected between the readings. Two processes with the same
-number differ by more than this, because the system uses all other numbers before it reuses one.
+A start time relative to 1970 changes if the system clock is corrected between the readings. The start times of two
+processes with the same number differ by more than this, because the system uses all other numbers before it reuses one.
 """
 
 

@@ -101,8 +101,7 @@ def joined(parts: Sequence[Responses]) -> Responses:
 
 
 def of_links(parts: Sequence[Responses], links: Sequence[NDArray[np.intp]]) -> Responses:
-    """Combine the responses for subsets of the links; `links` contains, for each subset, the indices [l] of its
-    links."""
+    """Combine the responses for subsets of the links; `links` contains the indices [l] of each subset's links."""
     count, arrays = sum(map(len, links)), []
     # Axis of the links in path loss, in observables, and in the derivatives of both quantities.
     for column, axis in zip(zip(*(part.arrays() for part in parts), strict=True), (1, 2, 1, 2), strict=False):

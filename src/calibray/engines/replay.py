@@ -1,4 +1,4 @@
-"""Replay: evaluates stored paths and their derivatives for any candidate, with one program per carrier."""
+"""Replay: evaluates stored paths, with derivatives, for any candidate, with one program per carrier."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ MOST_DERIVATIVES: Final = 2_000_000
 """Maximum number of derivatives with respect to material constants in one call, which limits memory use."""
 
 MAY_TABULATE: Final = 30_000
-"""Number of interactions above which coefficients can be read from tables."""
+"""Number of interactions above which interaction coefficients may be read from tables."""
 
 MOST_NODES: Final = 0.25
-"""Maximum number of table nodes per interaction; filling more nodes takes longer than the time that the tables save."""
+"""Maximum number of table nodes per interaction; filling more nodes would take longer than the tables save."""
 
 TABLE_TOLERANCE: Final = 1e-4
 """Maximum permitted error of a tabulated coefficient."""
 
 TABLE_CANDIDATES: Final = 32
-"""Number of candidates spread over the bounds, which together with the start values determine the resolution of the
-tables."""
+"""Number of candidates, spread over the bounds, that together with the start values determine the tables'
+resolution."""
 
 BATCH: Final = 32
 """Maximum number of candidates in one call."""
@@ -46,9 +46,9 @@ class Computation:
     """Settings for the evaluation of stored paths.
 
     Attributes:
-        dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
-            are combined by power, and double precision otherwise.
-        tabulate: Whether coefficients are read from tables; if None, tables are used if they are faster.
+        dtype: Precision, `numpy.float64` or `numpy.float32`; None selects single precision for large programs whose
+            paths are combined by power, and double precision otherwise.
+        tabulate: Whether coefficients are read from tables; None uses tables where they are faster.
         batch: Maximum number of candidates in one call; the program is compiled for this number.
     """
 
@@ -66,7 +66,7 @@ class Replay:
         parameters: The parameters whose values a candidate contains.
         combining: How a link's paths are combined: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        effects: Effects on the paths, with paths in the order of `paths`.
+        effects: Effects on the paths, which list the paths in the order of `paths`.
         computation: Precision, tables and batch size.
 
     Raises:
@@ -91,7 +91,7 @@ class Replay:
         self._dtype, self._batch = dtype, computation.batch
         self._combining = fields.Combining.make(combining, paths.link, paths.delay, bandwidth)
         # Row (material) and column (constant) of each parameter in the table of constants. Derivatives are computed for
-        # the columns in use, and then assigned to parameters.
+        # the columns in use and then assigned to the parameters.
         self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
         used_columns, self._used_column = np.unique(self._columns, return_inverse=True)
         self._used_columns = tuple(int(column) for column in used_columns)
@@ -109,7 +109,7 @@ class Replay:
 
     @property
     def parts(self) -> tuple[tuple[Replay, NDArray[np.intp]], ...]:
-        """The replay of every carrier with the indices of its links; in this class, this replay with all links."""
+        """The replay of every carrier with the indices of its links; here, only this replay with all links."""
         return ((self, np.arange(self.paths.num_links)),)
 
     @property
@@ -124,7 +124,7 @@ class Replay:
         if not self.effects and not walls:
             return self.path_loss(candidates)
         names = list(self.paths.materials)
-        # Each facade takes the material of the wall that it is part of.
+        # Each facade takes the material of its wall.
         whole = np.array([names.index(walls.get(name, name)) for name in names], self.paths.material.dtype)
         paths = replace(self.paths, material=whole[self.paths.material])
         return Replay(paths, self.parameters, *self._options).path_loss(candidates)
@@ -156,8 +156,8 @@ class Replay:
         if self._combining.kind == "power":
             self.calls += len(values)
             return responses
-        # Other ways of combining paths need more than path powers. The methods called below count the candidates
-        # themselves.
+        # Other ways of combining paths need more than the powers of the paths. The methods called below count the
+        # candidates themselves.
         if not derivatives:
             return replace(responses, path_loss=self.path_loss(candidates))
         loss, slope = self.path_loss_and_jacobian(candidates)
@@ -170,7 +170,7 @@ class Replay:
 
     @cached_property
     def _channel(self) -> fields.Channel:
-        """The paths in the form required to compute further observables."""
+        """The paths in the form that the computation of further observables requires."""
         plan = fields.layout(self.paths)
         return fields.Channel(
             plan.program,
@@ -192,7 +192,7 @@ class Replay:
     def _by_parameter(
         self, by_material: NDArray[np.floating], by_effect: NDArray[np.floating]
     ) -> NDArray[np.floating]:
-        """Derivatives by parameter [..., d], from derivatives with respect to material constants and effects."""
+        """Derivatives by parameter [..., d], from derivatives by material constant and by effect parameter."""
         jacobian = np.empty((*by_effect.shape[:-1], len(self.parameters)), by_effect.dtype)
         jacobian[..., self.parameters.of_materials] = by_material[..., self._rows, self._used_column]
         jacobian[..., self.parameters.of_effects] = by_effect
@@ -219,7 +219,7 @@ class Replay:
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._used_columns, self._combining, count
         )
-        # No effect applies to these links, so derivatives with respect to parameters of effects are 0.
+        # No effect applies to these links, so derivatives with respect to effect parameters are 0.
         by_effect = np.zeros((*loss.shape, len(self.parameters.of_effects)), slope.dtype)
         return loss, self._by_parameter(slope, by_effect), error
 
@@ -232,8 +232,8 @@ class Replay:
             *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             too_coarse = table_error > TABLE_TOLERANCE
             refused = np.flatnonzero(too_coarse.any(axis=(1, 2)))
-            # Candidates before the first refused candidate are accurate; evaluation resumes at this candidate with
-            # finer tables.
+            # The results of candidates before the first refused one are accurate. Evaluation resumes at the refused
+            # candidate with finer tables.
             done = refused[0] if len(refused) else len(batch)
             batches.append([np.asarray(answer[:done], dtype=float) for answer in answers])
             start += done
@@ -247,16 +247,16 @@ class Replay:
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Material constants [size, M, 8] and effect parameters [size, e] of a batch.
 
-        The program is compiled for `size` candidates; unused rows of the tables contain the base values.
+        The program is compiled for `size` candidates, so unused rows of the tables are filled with the base values.
         """
         tables = np.repeat(base[None], size, axis=0)
         tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
-        # Unused rows of effect parameters repeat values of the batch; answers for unused rows are discarded.
+        # Unused rows of effect parameters repeat values of the batch; the answers to unused rows are discarded.
         of_effects = np.resize(batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects)))
         return tables, of_effects
 
     def _table_intervals(self, force: bool) -> NDArray[np.int64] | None:
-        """Number of intervals of each table, by material and mode; None if evaluating every coefficient is faster."""
+        """Number of intervals in each table, by material and mode; None if evaluating the coefficients is faster."""
         if not force and self.interactions <= MAY_TABULATE:
             return None
         from scipy.stats import qmc  # the import takes 0.4 s
@@ -268,7 +268,7 @@ class Replay:
         return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
     def _refine_tables(self, too_coarse: NDArray[np.bool_]) -> None:
-        """Refine the tables marked in a mask [M, 3]; if a table would exceed `FINEST` intervals, stop using tables."""
+        """Refine the tables selected by a mask [M, 3]; if one would exceed `FINEST` intervals, stop using tables."""
         if self._intervals is not None:
             finer = np.where(too_coarse, 2 * self._intervals, self._intervals)
             self._intervals = finer if finer.max() <= fields.FINEST else None
@@ -280,7 +280,7 @@ class Replay:
         return plan.program
 
     def _batch_size(self) -> int:
-        """Number of candidates in one call: a power of two within the limits."""
+        """Number of candidates in one call, which is a power of two within the limits on memory and on candidates."""
         per_candidate = self.paths.num_links * len(self.materials) * len(self._used_columns)
         most = max(MOST_DERIVATIVES // max(per_candidate, 1), 1)
         return min(self._batch, 1 << most.bit_length() - 1)
@@ -342,7 +342,7 @@ class ReplayCarriers:
 
     @property
     def interactions(self) -> int:
-        """Number of interactions that are evaluated for a candidate, over all carriers."""
+        """Number of interactions that are evaluated for a candidate, summed over all carriers."""
         return sum(replay.interactions for replay, _, _ in self._carriers)
 
     @property
@@ -352,7 +352,7 @@ class ReplayCarriers:
 
     @property
     def large(self) -> bool:
-        """Whether any carrier has so many interactions that evaluating a candidate takes milliseconds."""
+        """Whether one of the carriers has so many interactions that evaluating a candidate takes milliseconds."""
         return any(replay.large for replay, _, _ in self._carriers)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The engine section of a study file, and the interface of the opened study that an engine requires."""
+"""The engine section of a study file, and the interface that an opened study offers to engines."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class RadioSettings:
 
 
 class OpenedStudy(Protocol):
-    """A study whose files have been read, with all that engines require; `calibray.Setup` implements this class."""
+    """A study whose files have been read, with everything that engines require; `calibray.Setup` implements it."""
 
     @property
     def links(self) -> Measurements:
@@ -120,7 +120,7 @@ class OpenedStudy(Protocol):
         ...
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects other than materials on the paths of the given links; None stands for all links."""
+        """Effects on the paths of the given links, other than those of materials; None stands for all links."""
         ...
 
     def at(self, links: Measurements) -> Self:
@@ -145,12 +145,12 @@ class EngineSection(Section, ABC):
 
     To add a kind of engine, write one final subclass in a separate module in `engines.kinds`; the subclass is found
     automatically. The fields of the class are the keys of the section in the study file, and `name` is a literal. Put
-    heavy imports into `open`, because reading any study file imports all kinds of engines.
+    slow imports inside `open`, because reading any study file imports all kinds of engines.
 
     Attributes:
         name: The name of the kind in study files.
-        expensive: Whether a call takes longer than reading a stored answer; if so, a ledger stores the calls.
-        external: Whether an external program computes the answers and no ray tracer is needed.
+        expensive: Whether a call takes longer than reading a stored answer; if so, a ledger stores the answers.
+        external: Whether an external program computes the answers, so that no ray tracer is needed.
         chunked: Whether chunks of links can be traced and replayed on workers.
     """
 
@@ -166,7 +166,7 @@ class EngineSection(Section, ABC):
 
     @abstractmethod
     def answers_by(self, study: OpenedStudy) -> list[str] | None:
-        """The versions or the command line that determine the answers; None if answers are not stored in a ledger."""
+        """The versions or the command line on which the answers depend; None if answers are not stored in a ledger."""
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
         """SHA-256 of the program's files in the study's folder, by the names on the command line."""
@@ -178,7 +178,7 @@ class EngineSection(Section, ABC):
     ) -> Engine:
         """The engine for all links of a study; `paths` contains the paths if they have already been traced.
 
-        Workers run the calls of a batch if the kind is `external`, and keep chunks of links if it is `chunked`.
+        Workers run the calls of a batch if `external` is True, and keep chunks of links if `chunked` is True.
 
         Raises:
             InputError: This kind of engine cannot be used for the study.

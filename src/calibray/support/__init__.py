@@ -1,1 +1,1 @@
-"""General-purpose support code: caches, output files, messages, progress and interruption."""
+"""General-purpose code for caches, output files, messages, progress and interruption."""

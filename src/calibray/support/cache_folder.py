@@ -1,4 +1,4 @@
-"""Calibray's cache folder, which keeps data between runs; all of these data can be recomputed.
+"""Calibray's cache folder, which keeps data between runs. All of these data can be recomputed.
 
 The environment variable `CALIBRAY_CACHE` sets the folder; by default, it is `calibray` in the user's cache folder. An
 empty `CALIBRAY_CACHE` disables caching.
@@ -25,8 +25,8 @@ _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | g
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
 """Length of the SHA-256 digest at the start of each entry [bytes]."""
 _PRUNED_AT: Final = 16
-"""Average number of writes between two checks of the total size. With 7,000 entries, a check takes 0.08 s, about as
-long as compiling a small program."""
+"""Average number of writes per check of the total size. With 7,000 entries, a check takes 0.08 s, about as long as
+compiling a small program."""
 
 
 def cache_folder() -> Path | None:
@@ -39,16 +39,16 @@ def cache_folder() -> Path | None:
 
 @dataclass(frozen=True)
 class Store:
-    """Store of checksummed entries for data that must be trusted, in a folder that only the user can write to.
+    """Store of entries with checksums, for data that must be trusted, in a folder to which only the user can write.
 
-    An entry is either complete or absent, because it is moved into place only once it is fully written. A damaged entry
+    An entry is either complete or absent, because it is moved into place only when it is fully written. A damaged entry
     is removed when it is read. Entries that cannot be read or written are skipped without an error.
 
     Attributes:
         path: The folder, which need not exist.
         suffix: The file extension of the entries.
-        limit: Limit on the total size [bytes]. Above this limit, about one in `_PRUNED_AT` writes removes the least
-            recently read entries.
+        limit: Limit on the total size [bytes]. If the total size exceeds this limit, about one in `_PRUNED_AT` writes
+            removes the least recently read entries.
     """
 
     path: Path
@@ -57,13 +57,13 @@ class Store:
 
     @property
     def trusted(self) -> bool:
-        """Whether the folder, which is created if needed, belongs to the user and is not writable by others."""
+        """Whether the folder belongs to the user and is not writable by others; it is created if necessary."""
         with suppress(OSError), self._folder():
             return True
         return False
 
     def get(self, name: str) -> bytes | None:
-        """Read an entry; None if it is absent or damaged, or if the folder is not trusted."""
+        """Read an entry; return None if it is absent or damaged, or if the folder is not trusted."""
         with suppress(OSError), self._folder() as folder:
             file = self._file(name, folder)
             with os.fdopen(os.open(file, os.O_RDONLY | _NO_LINK, dir_fd=folder), "rb") as stream:
@@ -90,17 +90,17 @@ class Store:
                 with suppress(OSError):
                     os.unlink(partial, dir_fd=folder)
                 raise
-            # The digest of the name decides whether the size is checked; about one name in `_PRUNED_AT` triggers a
-            # check.
+            # The digest of the entry's name decides whether the total size is checked; about one name in `_PRUNED_AT`
+            # triggers a check.
             if hashlib.sha256(name.encode()).digest()[0] % _PRUNED_AT == 0:
                 self._remove_oldest()
 
     @contextmanager
     def _folder(self) -> Iterator[int | None]:
-        """Open the folder, creating it if needed, and check who can write to it.
+        """Open the folder, which is created if necessary, and check who can write to it.
 
-        The check applies to the opened folder. Anyone who can write to a parent folder could replace the cache folder
-        afterwards.
+        The check applies to the folder as opened, because anyone who can write to a parent folder could replace the
+        cache folder afterwards.
 
         Yields:
             The folder's file descriptor; None on Windows, where other users have no access to a user's folders.
@@ -124,7 +124,7 @@ class Store:
             os.close(folder)
 
     def entries(self) -> list[Path]:
-        """The files of the entries, most recently read first; other files in the folder are left out."""
+        """The files of the entries, most recently read first; other files in the folder are ignored."""
         ages = []
         with suppress(OSError):
             for path in self.path.glob(f"*{self.suffix}"):

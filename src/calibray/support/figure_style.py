@@ -1,7 +1,7 @@
-"""The common style of all figures: colours suited to colour-blind readers, no unnecessary lines, and units on the axes.
+"""The common style of all figures: colours for colour-blind readers, no unnecessary lines, and units on the axes.
 
-Most line colours are those of Okabe and Ito (2008). A figure on an HTML page takes the colours of its axes and text
-from the page, so that the figure is readable on light and dark backgrounds.
+Most line colours are from the palette of Okabe and Ito (2008). A figure on an HTML page takes the colours of its axes
+and text from the page, so that the figure is readable on both light and dark backgrounds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BLUE: Final = "#0072b2"
 ORANGE: Final = "#d55e00"
 GREEN: Final = "#009e73"
 PALETTE: Final = ("#cc79a7", "#e69f00", "#56b4e9", "#8c5a3c", "#882255", "#6f7f2e", "#5c6bc0", "#777777")
-"""Additional line colours, used after the named colours."""
+"""Further line colours, used once the named colours are exhausted."""
 
 COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
 """Colour of each optimizer: the methods of the paper, and Calibray's own methods."""
@@ -40,7 +40,7 @@ _SETTINGS: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.size": 10,
     "text.color": INK,
-    # Names come from files, and a dollar sign in a name must not start a formula.
+    # Names come from files, so a dollar sign in a name must not start a formula.
     "text.parse_math": False,
     "axes.labelcolor": INK,
     "axes.edgecolor": FAINT,
@@ -60,7 +60,7 @@ def styled(text_as: str = "path") -> Iterator[None]:
 
 
 def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tuple[Figure, Axes]:
-    """Make an empty single-panel figure in the common style, with labels that state units; sizes are in inches."""
+    """Make an empty single-panel figure in the common style, with axis labels that state units; sizes are in inches."""
     with styled():
         figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
         axes = figure.add_subplot()

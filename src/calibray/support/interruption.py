@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C in compiled code, where a library can drop the interruption or convert it into another error."""
+"""Handling of Ctrl-C in compiled code, where a library can drop the interruption or convert it to another error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TERMINATED: Final = 128 + signal.SIGTERM
 """Exit status after SIGTERM, which schedulers and `timeout` send."""
 
 INTERVAL: Final = 0.2
-"""Time after which a dropped interruption is raised again [s], short enough that a user does not notice the delay."""
+"""Time [s] after which a dropped interruption is raised again, short enough that a user does not notice the delay."""
 
 Handler = Callable[[int, FrameType | None], None]
 """Signal handler: a function of the signal number and the interrupted frame."""
@@ -26,7 +26,7 @@ Handler = Callable[[int, FrameType | None], None]
 
 @contextmanager
 def unwrap_interruption() -> Iterator[None]:
-    """Raise KeyboardInterrupt in place of the error into which a library converted it.
+    """Raise KeyboardInterrupt in place of the error to which a library converted it.
 
     Yields:
         Nothing; the block may call Dr.Jit or import compiled modules.
@@ -54,8 +54,9 @@ def unwrap_interruption() -> Iterator[None]:
 def ensure_interruption() -> Iterator[None]:
     """Ensure that Ctrl-C ends the block, even if a library handles or drops the interruption.
 
-    Compiled code can drop an interruption that occurs in its callbacks, or raise another error instead. Within this
-    context, a dropped interruption is raised again, and any error after Ctrl-C is treated as an interruption.
+    Compiled code can drop an interruption that occurs in one of its callbacks, or raise another error instead. Within
+    this context, a dropped interruption is raised again, and any error that follows Ctrl-C is treated as an
+    interruption.
 
     Yields:
         Nothing. Outside the main thread, or if another handler for Ctrl-C is set, the block runs unchanged.
@@ -77,7 +78,7 @@ def ensure_interruption() -> Iterator[None]:
 
 
 def acknowledge_interruption() -> None:
-    """Stop raising the interruption again, because the caller has caught it and will raise it after saving results."""
+    """Stop repeating the interruption, because the caller has caught it and will raise it after saving results."""
     if signal.getsignal(signal.SIGALRM) is _raise_again:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
@@ -105,7 +106,7 @@ def _handler(number: signal.Signals, default: Handler | signal.Handlers, handler
 
 def _press(number: int, frame: FrameType | None) -> None:
     _pressed.append(number)
-    # A thread would be unsafe here: the interrupted code can hold the locks of the threading module.
+    # Starting a thread here would be unsafe, because the interrupted code can hold locks of the threading module.
     if signal.getsignal(signal.SIGALRM) is _raise_again:
         signal.setitimer(signal.ITIMER_REAL, INTERVAL, INTERVAL)
         if _initializes_extension(frame):
@@ -123,7 +124,7 @@ def _raise_again(_: int, frame: FrameType | None) -> None:
 
 
 def _initializes_extension(frame: FrameType | None) -> bool:
-    """Whether a compiled module is being initialized; an exception during initialization can abort the process."""
+    """Whether a compiled module is being initialized, when an exception can abort the process."""
     while frame is not None:
         if frame.f_code in (
             ExtensionFileLoader.create_module.__code__,

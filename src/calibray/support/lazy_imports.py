@@ -1,4 +1,4 @@
-"""Deferred imports of a package's names, which keep the import of the package fast, and of optional libraries."""
+"""Deferred imports: of a package's names, so that importing the package stays fast, and of optional libraries."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def lazy_attributes(
 
 
 def library(name: str, extra: str) -> ModuleType:
-    """Import an optional module, which is installed by one of Calibray's extras.
+    """Import an optional module that one of Calibray's extras installs.
 
     Raises:
         InputError: The module is not installed, or cannot be loaded.

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 LEAST_ADDRESS_SPACE: Final = 2_900_000_000
-"""Minimum limit on the address space [bytes]; with a lower limit, libraries fail to load or terminate the process."""
+"""Lowest permitted limit on the address space [bytes]; below it, libraries fail to load or terminate the process."""
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
-"""Folder of the container's control group (version 2), which states the memory limit."""
+"""Folder of the container's control group (version 2), whose files state the memory limit."""
 
 
 def check_address_space() -> None:
@@ -41,10 +41,10 @@ def check_address_space() -> None:
 
 
 def available_memory() -> int:
-    """Memory that can be allocated before the system kills the process or refuses further allocations [bytes].
+    """Memory [bytes] that can still be allocated before the system kills the process or refuses further allocations.
 
-    This is the smallest of the amounts still available from the system, in the container, and under the address space
-    limit (`ulimit -v`).
+    This is the smallest of three amounts: what is still available in the system, in the container, and under the limit
+    on the address space (`ulimit -v`).
     """
     import psutil  # imported here because `check_address_space` runs without it
 
@@ -65,13 +65,13 @@ def available_memory() -> int:
 
 
 def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
-    """Make a context in which linear algebra uses a single thread; the context has no effect if `wanted` is False."""
+    """Make a context in which linear algebra uses a single thread, or a context without effect if `wanted` is False."""
     return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
 
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The loaded BLAS libraries, cached because finding them requires reading all memory maps of the process."""
+    """The loaded BLAS libraries, cached because finding them requires reading the process's complete memory map."""
     # SciPy is imported first, so that its BLAS library is among the loaded libraries.
     import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
@@ -83,7 +83,7 @@ SECONDS: Final = 20.0
 """Time limit for reading a small file [s]; on a busy machine, starting the process takes most of this time."""
 
 REFUSED: Final = 3
-"""Exit status of code that refuses its input file; the code prints the reason to stdout."""
+"""Exit status by which code refuses its input file; the code prints the reason to stdout."""
 
 _LIMITS: Final = """
 import sys
@@ -116,7 +116,7 @@ def run_limited(code: str, memory: int, size: int) -> bool:
     """
     if not sys.executable:
         return True  # an embedded interpreter cannot start another interpreter
-    # The time limit allows for large files to be read at 20 MB/s.
+    # The time limit is long enough to read large files at 20 MB/s.
     limit = SECONDS + size / 20e6  # [s]
     program = _LIMITS.format(path=sys.path, memory=memory, refused=REFUSED) + code
     try:

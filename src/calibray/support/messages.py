@@ -1,4 +1,4 @@
-"""Parts of messages, such as suggestions for unknown names, shortened values and durations."""
+"""Parts of messages: suggestions for unknown names, shortened values, durations and the like."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_LENGTH: Final = 80
 MAX_LISTED: Final = 20
 """Maximum number of names or errors that a message lists."""
 MAX_COMPARED: Final = 2_000
-"""Maximum number of valid names that an unknown name is compared with."""
+"""Maximum number of valid names with which an unknown name is compared."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -49,10 +49,9 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    r"""Escape all characters that a terminal or an editor would interpret, because a text can quote names from files.
+    r"""Escape all characters that a terminal or an editor would interpret, because a text may quote names from files.
 
-    Characters in `keep`, such as line breaks, are left unchanged; the escaped characters become Python escape
-    sequences.
+    Characters in `keep`, such as line breaks, are left unchanged. All others become Python escape sequences.
 
     Example:
         >>> printable("RSS\x1b[2J\n[engine]")
@@ -69,7 +68,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error's message, or the error's type if it has no message.
+    """The first line of an error's message, or the error's type if the message is empty.
 
     Example:
         >>> first_line(KeyError())
@@ -120,7 +119,7 @@ def percent(share: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format an estimated time [s] as a rounded number of seconds, minutes, hours or days.
+    """Format an estimated duration [s] as a rounded number of seconds, minutes, hours or days.
 
     Example:
         >>> duration(26_700.0)

@@ -1,11 +1,11 @@
-"""Output files, which are checked before any computation starts and are always written completely.
+"""Output files, which are checked before any computation starts and are written either completely or not at all.
 
 An output never replaces an input, a link or a device. By default, an output also never replaces a file that Calibray
-did not write or that has changed since Calibray wrote it. Calibray signs its files: the file `.calibray` in the same
-folder lists the digest and the name of each file.
+did not write, or one that has changed since Calibray wrote it. Calibray signs its files: the file `.calibray` in the
+same folder lists the digest and the name of each file.
 
-`replacing` creates each file under a random name in the same folder, without following links. Once the file is
-complete, it is moved into place in one step.
+`replacing` creates each file under a random name in the same folder, without following links. When the file is
+complete, it is moved into place in a single step.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its
 
 _UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process id
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
-# Windows lacks the first two flags, but links require special privileges on Windows, and folders contain no FIFOs.
+# Windows lacks the first two flags, but there links require special privileges, and folders contain no FIFOs.
 NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def as_path(name: object, role: str) -> Path:
-    """Convert a file or folder name given by a caller to a path; error messages start with `role`.
+    """Convert a caller's name of a file or folder to a path; error messages start with `role`.
 
     Raises:
         InputError: The name is neither text nor a path.
@@ -60,11 +60,11 @@ def exists(file: str | Path) -> bool:
         return False
 
 
-# Checks that run before the computation and create nothing.
+# The checks below run before the computation and create nothing.
 
 
 def check_folder(folder: str | Path) -> Path:
-    """Refuse a folder to which no file can be written; the folder need not exist.
+    """Refuse a folder in which no file can be created; the folder need not exist.
 
     Raises:
         InputError: The folder, or the folder in which it would be created, is a file or cannot be written to.
@@ -81,14 +81,14 @@ def check_folder(folder: str | Path) -> Path:
 def check_outputs(
     folder: str | Path, names: Sequence[str], inputs: Iterable[Path] = (), overwrite: bool = False
 ) -> Path:
-    """Refuse a folder to which files cannot be written, or that contains files that must not be replaced.
+    """Refuse a folder in which no file can be created, or in which an output would replace a file that must be kept.
 
     `inputs` are the files that the computation reads, which are never replaced. With `overwrite`, files that Calibray
     did not write are replaced.
 
     Raises:
-        InputError: A check of `check_folder` or `check_replaceable` fails, or Calibray did not write the file
-            `.calibray` in the folder.
+        InputError: A check of `check_folder` or `check_replaceable` fails, or the folder's file `.calibray` was not
+            written by Calibray.
     """
     target, sources = check_folder(folder), list(inputs)
     _check_signature_file(target)
@@ -119,7 +119,7 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
 
 
 def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
-    """Refuse to replace a file that must be kept; a file that does not exist is accepted.
+    """Refuse an output that would replace a file that must be kept; an output that does not exist yet is accepted.
 
     Raises:
         InputError: The file is an input, a link, a device or a folder; or `overwrite` is False, and the file was not
@@ -145,7 +145,7 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
 
 
 def check_unchanged(file: Path) -> None:
-    """Refuse a file that has changed since Calibray signed it; an unsigned file may have any content.
+    """Refuse a file that has changed since Calibray signed it; unsigned files are accepted.
 
     Raises:
         InputError: The file has changed since it was written.
@@ -159,7 +159,7 @@ def check_unchanged(file: Path) -> None:
 
 
 def is_unchanged_output(file: Path) -> bool:
-    """Whether a file is unchanged since Calibray signed it; path files, which have their own seal, always pass."""
+    """Whether a file is unchanged since Calibray signed it; always True for path files, which have their own seal."""
     if _signature(file, file.name) in _signatures(file.parent):
         return True
     with file.open("rb") as stream:
@@ -197,7 +197,7 @@ def _signatures(folder: Path) -> list[str]:
 
 def _check_signature_file(folder: Path) -> None:
     """Refuse a folder whose signature file was not written by Calibray, because files in it could not be signed."""
-    # If the signature file cannot be read, writing fails later with the same message as for any other file.
+    # If the signature file cannot be read, writing to it fails later, with the same message as for any other file.
     with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
         pass
 
@@ -264,7 +264,7 @@ HDF5_METADATA: Final = 2**16  # generous size of an HDF5 file without its datase
 
 
 def check_space(partial: Path, size: int) -> None:
-    """Raise an error if an HDF5 file with datasets of a given size [bytes] would not fit on its disk.
+    """Raise an error if an HDF5 file whose datasets have the given total size [bytes] would not fit on its disk.
 
     On a full disk, the HDF5 library prints errors that cannot be caught, and may crash the process when it exits.
 
@@ -277,14 +277,14 @@ def check_space(partial: Path, size: int) -> None:
 
 @contextmanager
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
-    """Write a file under a temporary name; once it is complete, it is signed and moved into place.
+    """Write a file under a temporary name; when it is complete, it is signed and moved into place.
 
     Files with their own seal need not be signed. Yields an empty temporary file in the same folder; this file is
     removed if writing fails.
 
     Raises:
-        InputError: The file is a link, a device or a folder; Calibray did not write `.calibray`; or another program
-            replaced the temporary file.
+        InputError: The file is a link, a device or a folder; `.calibray` was not written by Calibray; or another
+            program replaced the temporary file.
     """
     check_replaceable(
         path, overwrite=True
@@ -313,7 +313,7 @@ def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
 def _sign(partial: Path, path: Path) -> None:
     """Add the signature line of a file to the folder's signature file."""
     signature = _signature(partial, path.name)
-    # The search is skipped for a new file, which is rarely signed already; a repeated line does no harm.
+    # The search is skipped for a new file, because it is rarely signed already and a repeated line does no harm.
     if path.exists() and signature in _signatures(path.parent):
         return
     with _open_signatures(path.parent, os.O_RDWR | os.O_CREAT | os.O_APPEND) as stream:
@@ -323,7 +323,7 @@ def _sign(partial: Path, path: Path) -> None:
 def _remove_unfinished(path: Path) -> None:
     """Remove the unfinished files of processes that were killed while writing this file."""
     final = path.name
-    # A scene's folder may contain thousands of files, and making a Path for each of them takes a long time.
+    # A scene's folder may contain thousands of files, and creating a Path for each of them would take long.
     with os.scandir(path.parent) as entries:
         unfinished = [
             (path.with_name(entry.name), match)
@@ -343,12 +343,12 @@ def _remove_unfinished(path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file and move it into place once it is complete."""
+    """Write a text file and move it into place when it is complete."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file and move it into place once it is complete."""
+    """Write a file and move it into place when it is complete."""
     with replacing(path) as partial:
         partial.write_bytes(content)
 
@@ -369,7 +369,7 @@ if TYPE_CHECKING:
 
 TABLES: Final = (".csv", ".parquet")
 
-# Texts that a spreadsheet would evaluate as a formula, or that are already marked with an apostrophe.
+# Matches texts that a spreadsheet would evaluate as a formula, or that are already marked with an apostrophe.
 _FORMULA: Final = re.compile("'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20].", re.DOTALL)
 
 
@@ -407,7 +407,7 @@ def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool 
         header=header,
         float_format=float_format,
         lineterminator="\n",
-        # Python's writer does not quote a carriage return, which readers interpret as the end of a line.
+        # Python's writer does not quote carriage returns, which readers would interpret as the end of a line.
         quoting=csv.QUOTE_NONNUMERIC if returns else csv.QUOTE_MINIMAL,
     )
 
@@ -435,15 +435,16 @@ def without_formula_mark(cell: str) -> str:
 
 @contextmanager
 def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
-    """Write a CSV or Parquet file in parts and move it into place once it is complete.
+    """Write a CSV or Parquet file in parts, and move it into place when it is complete.
 
-    Yields a function that appends rows without their index; all tables must have the columns and types of the first.
+    Yields a function that appends the rows of a table, without their index; all tables must have the same columns and
+    types as the first.
 
     Raises:
         InputError: A check of `check_table` fails, the type of a column changes, or pyarrow, which Parquet needs, is
             missing.
     """
-    # An earlier check, before the computation, ensured that the file may be replaced.
+    # A check before the computation has ensured that the file may be replaced.
     target = check_table(path, overwrite=True)
     write = _csv if target.suffix.lower() == ".csv" else _parquet
     with replacing(target) as partial, write(partial, target) as append:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""A function of the stage ("tracing", "calibrating", ...), the amount done, and the total amount (None if unknown).
-
-An interim result follows the name of the stage after a colon: "calibrating: best RMSE 3.10 dB".
+"""A function of the stage ("tracing", "calibrating", ...), the amount done, and the total amount (None if unknown). The
+name of the stage can be followed by a colon and an interim result: "calibrating: best RMSE 3.10 dB".
 """
 
 
@@ -49,7 +48,7 @@ def with_prefix(progress: Progress | None, prefix: str) -> Progress | None:
 
 
 def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Report the progress of one part as progress of the whole; `before` is the amount done in all earlier parts.
+    """Report the progress of one part as progress of the whole; `before` is the total amount of all earlier parts.
 
     Example:
         >>> progress = with_total(lambda *parts: print(*parts), 100, 250)

@@ -1,4 +1,4 @@
-"""Strict models of file contents, which refuse unknown keys and wrong types, and the error messages of these models."""
+"""Strict models of file contents, which refuse unknown keys and wrong types, and the models' error messages."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ def explain(
     source: str,
     tagged: Sequence[str] = (),
 ) -> InputError:
-    """Combine all errors in one message; each error has a line with the file, the dotted key, the value and the bound.
+    """Combine all errors in one message; the line of each states the file, the dotted key, the value and the bound.
 
-    The message suggests valid keys for misspelled keys. `tagged` lists the tables that exist in several kinds; the key
-    `name` states the kind.
+    The message suggests valid keys for misspelt keys. `tagged` lists the tables of which there are several kinds; in
+    such a table, the key `name` states the kind.
     """
     lines: dict[str, str] = {}
     for fault in error.errors():
         location = fault["loc"]
         if location[:1] and location[0] in tagged:
-            # Pydantic puts the kind after the table's name, but the kind is not a key in the file.
+            # In its locations, Pydantic puts the kind after the table's name, but the kind is not a key in the file.
             location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
         path = _path(location, content, fault["type"] == "missing")
         key = dotted(path)
@@ -78,7 +78,7 @@ def explain(
             text = describe_fault(fault)
             # A message about a whole table already contains the key.
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
-        # A value that matches none of several allowed types causes one error per type.
+        # A value that matches none of the permitted types causes one error per type.
         if key not in lines:
             lines[key] = line
         elif fault["type"] in _WORDS and not lines[key].endswith(text := describe_fault(fault)):
@@ -99,7 +99,7 @@ def describe_fault(fault: Mapping[str, Any]) -> str:
 
 
 def dotted(path: Sequence[str | int]) -> str:
-    """Format a key in TOML notation, for instance ``parameters."walls.thickness".bounds[1]``."""
+    """Format a key in TOML notation, for example ``parameters."walls.thickness".bounds[1]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -111,7 +111,7 @@ def dotted(path: Sequence[str | int]) -> str:
 
 
 def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
-    """Remove type names from Pydantic's location of an error; only the last key may be missing from the content."""
+    """Remove type names from the location of a Pydantic error; only the last key may be missing in the content."""
     path: list[str | int] = []
     for index, part in enumerate(location):
         last = index == len(location) - 1
@@ -135,7 +135,7 @@ def _shown(path: Sequence[str | int], content: Any) -> str:
 
 
 def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
-    """The keys of a model at a path, for all kinds of tables allowed there."""
+    """The keys of a model at a path, for all kinds of table that are permitted there."""
     models = [model]
     for part in path:
         models = [table for known in models for table in _tables(_annotation(known, str(part)))]

@@ -125,8 +125,7 @@ def _do_task(task: _Task[Any, Any]) -> Any:
 
 
 def identity(value: Content) -> Content:
-    """Return the argument. Used where an object is itself the answer of a chunk, or where an object is sent
-    unchanged."""
+    """Return the argument; used if an object is itself the answer of a chunk, or if an object is sent unchanged."""
     return value
 
 
@@ -144,8 +143,7 @@ def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) 
 
 
 def chunk_size(stated: int | None, count: int) -> int:
-    """Maximum number of links per chunk, from the maximum stated in the study (if any) and the total number of
-    links."""
+    """Maximum number of links per chunk, from the study's maximum (if any) and the total number of links."""
     return stated or max(CHUNK_LINKS, -(-count // MOST_CHUNKS))
 
 

@@ -67,8 +67,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class _KeptRemotely:
-    """Objects on workers, one per chunk: the address of the worker that last made the object, and Dask's reference to
-    it."""
+    """Objects on workers, one per chunk: the worker that last made the object, and Dask's reference to it."""
 
     make: Callable[[Any], Any]
     sources: list[Any]

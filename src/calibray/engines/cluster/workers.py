@@ -69,10 +69,11 @@ class Workers(Protocol):
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a picklable function for every chunk, with the objects kept for it, and return the results by chunk. The
-        objects are the first arguments of the function; `kept` contains their handles, as returned by `keep`. All other
-        arguments are the same for all chunks. `answered` is called with a chunk's index after the chunk's answer has
-        arrived.
+        """Call a picklable function for every chunk with the chunk's objects, and return the results by chunk.
+
+        The objects are the first arguments of the function; `kept` contains their handles, as returned by `keep`. All
+        other arguments are the same for all chunks. `answered` is called with a chunk's index after the chunk's answer
+        has arrived.
 
         Raises:
             EngineError: Workers die repeatedly, or none is left.
@@ -324,8 +325,7 @@ class LocalWorkers:
             worker.pipe.send_bytes(content)
 
     def _receive(self) -> list[tuple[int, tuple[Any, Exception | None] | None]]:
-        """The answers received so far, each preceded by its worker's index; None as the answer means that the worker
-        died."""
+        """The answers received, each with its worker's index; None stands for the answer of a worker that died."""
         homes = {worker.pipe: home for home, worker in enumerate(self._workers)}
         answers: list[tuple[int, tuple[Any, Exception | None] | None]] = []
         for pipe in cast(list[Connection], wait(list(homes), POLL)):

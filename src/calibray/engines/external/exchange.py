@@ -212,8 +212,7 @@ def read_rays(path: Path, num_links: int) -> bytes:
 
 
 def _read_bytes(path: Path, limit: int) -> bytes:
-    """The bytes of a response. Only a regular file is read, because a program can create any type of file at this
-    path."""
+    """The bytes of a response. Only a regular file is read, because a program can leave any type of file."""
     try:
         # With O_NOFOLLOW, `open` does not follow a link; with O_NONBLOCK, `open` does not wait for the writer of a
         # FIFO.

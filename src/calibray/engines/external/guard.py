@@ -1,5 +1,4 @@
-"""The guard runs an external program, limits the output that it keeps, and at the end kills all processes that the
-program started.
+"""The guard runs an external program, limits its output, and at the end kills all processes that the program started.
 
 The guard is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of
 Calibray. There are two reasons to run the guard as a process between Calibray and the program. First, on Linux the
@@ -88,8 +87,7 @@ def main(timeout: float, words: list[str]) -> dict[str, object]:
 
 
 def _prctl():
-    """The system call that makes a process adopt orphans or die with its parent; on systems other than Linux, a
-    function without effect."""
+    """The system call that makes a process adopt orphans or die with its parent; outside Linux, a dummy function."""
     if sys.platform != "linux":
         return lambda option, value: None
     library = ctypes.CDLL(None)

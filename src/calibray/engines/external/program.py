@@ -239,8 +239,7 @@ def _describe_status(status: int) -> str:
 
 @contextmanager
 def _call_folder() -> Iterator[Path]:
-    """A temporary folder for one call, with a file that identifies its owner; folders whose owner has ended are
-    removed."""
+    """A temporary folder for one call, with a file that names its owner; folders whose owner has ended are removed."""
     try:
         parent = Path(tempfile.gettempdir())
         _remove_abandoned(parent)

@@ -161,8 +161,7 @@ class Ledger:
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
-        """Claim the candidates that this run will compute. The claims are released by `commit` and at the end of
-        `working`.
+        """Claim the candidates that this run will compute; `commit` and the end of `working` release the claims.
 
         Returns the candidates that have no answer and are not claimed by another run.
 
@@ -214,8 +213,7 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, database.LedgerEntry]],
     ) -> str:
-        """Write the answers that the ledger could not store to a rescue file, and return a sentence that states the
-        file's path."""
+        """Write answers missing in the ledger to a rescue file, and return a sentence with the file's path."""
 
         def fill(connection: sqlite3.Connection) -> None:
             database.set_up(connection, self.path)
@@ -227,8 +225,7 @@ class Ledger:
         return _describe_rescue(database.write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete the failed calls of one problem or of all problems, so that they are run again; return how many were
-        deleted.
+        """Delete the failed calls of one problem or of all, so that they are run again; return how many were deleted.
 
         Raises:
             InputError: The ledger is read-only.

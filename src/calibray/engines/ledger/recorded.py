@@ -40,7 +40,7 @@ class Recorded:
         name: Name of the engine.
         progress: Called with "waiting", the number of answers received from other runs, and the total number of answers
             expected from them.
-        program_files: SHA-256, by file name, of the files of the engine's program; empty if there are none.
+        program_files: SHA-256 of the files of the engine's program, by file name, if the program has files.
 
     Attributes:
         hits: Number of candidates so far that required no RT call, because the candidate was in the ledger or occurred
@@ -82,8 +82,7 @@ class Recorded:
         return self._engine.materials
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the ledger if stored there, otherwise from the engine; see
-        `Answering`."""
+        """Path loss of every link for candidates, from the ledger or otherwise from the engine; see `Answering`."""
         answers, first = self._all_answers(candidates)
         return gather(answers, (len(candidates), self._engine.num_links), first)
 
@@ -124,8 +123,7 @@ class Recorded:
             self._ledger.forget_failures(self._problem)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Yield answers, from the ledger if stored there and otherwise from the engine, until `stop` is set; see
-        `Answering.answers`."""
+        """Yield answers from the ledger, or otherwise from the engine, until `stop` is set; see `Answering.answers`."""
         values, stop = candidates, stop or Event()
         self._warn_of_changed_files()
         # A candidate that occurs several times in one batch is run only once.
@@ -153,8 +151,7 @@ class Recorded:
                 pause = min(2 * pause, LONGEST_WAIT)
 
     def _warn_of_changed_files(self) -> None:
-        """Before the first answer, warn if the program's files have changed since the calls in the ledger were
-        stored."""
+        """Before the first answer, warn if the program's files have changed since the stored calls."""
         files, self._unchecked_files = self._unchecked_files, {}
         if files and (changed := self._ledger.changed_program_files(self._problem, files)):
             _LOG.warning(

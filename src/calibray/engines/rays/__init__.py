@@ -1,1 +1,1 @@
-"""Ray tables: the paths of any engine, read into a path program or written from a path program."""
+"""Ray tables: the paths of any engine, converted to a path program or written from one."""

@@ -1,7 +1,7 @@
-"""Conversion of ray tables to path programs, with checks and a correction for every path, and the reverse conversion.
+"""Conversion of ray tables to path programs, with checks and a correction for every path, and conversion back.
 
-The correction is the power stated by the engine divided by the power in replay. The correction accounts for properties
-that only the engine models, such as its antennas. At other constants, the replayed power is multiplied by the
+A path's correction is the power that the engine states divided by the power in replay. It accounts for properties that
+only the engine models, such as its antennas. At any other constants, the replayed power is multiplied by this
 correction.
 """
 
@@ -34,33 +34,33 @@ from calibray.tracing.settings import Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 UNKNOWN: Final = Antenna("iso", "VH")
-"""Antenna assumed at an end whose antenna is unknown. The two ports of this antenna cover every polarization, and the
+"""Antenna assumed at an end of a link whose antenna is unknown. Its two ports cover every polarization, and the
 correction accounts for the gain of the real antenna.
 """
 
 FREE_SPACE_DB: Final = 1.0
-"""Maximum deviation of a direct path from free-space power if the antennas are known [dB]. Pattern tables of engines
-differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes errors of tens of
-decibels.
+"""Maximum deviation of a direct path from free-space power if the antennas are known [dB]. The pattern tables of
+different engines differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes
+deviations of tens of decibels.
 """
 
 DIRECT_GAIN_DB: Final = 60.0
-"""Maximum total gain of both antennas of a direct path [dB], for example of two dishes with 30 dBi each."""
+"""Maximum total gain [dB] of the two antennas of a direct path, for example of two dishes with 30 dBi each."""
 
 ROUNDING: Final = 1e-12
 """Power relative to free space below which a path is assumed to lie in a null of the antennas. The value corresponds to
-a few rounding errors of a field in single precision, as in Sionna RT.
+a few rounding errors of a field computed in single precision, as in Sionna RT.
 """
 
 HIGH_GAIN_DB: Final = 25.0
-"""A warning is issued if the magnitude of the median total gain of unknown antennas exceeds this value [dB]. The value
+"""A warning is issued if the median total gain of unknown antennas exceeds this value [dB] in magnitude. The value
 corresponds to 18 dBi at one end and 7 dBi at the other.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class RaySetting:
-    """Context for compiling the paths of a table.
+    """What is needed, besides the table, to compile the paths of a ray table.
 
     Attributes:
         scene: The scene, with the constants that the engine used.
@@ -81,10 +81,10 @@ class RaySetting:
 
 
 def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
-    """Compile the paths of a table; paths with zero power are omitted, but their links are kept.
+    """Compile the paths of a table. Paths with zero power are omitted, but their links are kept.
 
     Raises:
-        InputError: The table contradicts the scene, the links or itself; or `links` is None, and no path has a power
+        InputError: The table contradicts the scene, the links or itself; or `links` is None and no path has a power
             above 0.
     """
     scene = setting.scene
@@ -106,11 +106,11 @@ def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
     settings = {"rays": table.source, "scene": scene.source, "largest_distance_m": distance}
     paths = replace(paths, settings=settings)
     if scene.local_origin.any():
-        # Vertices far from the origin are kept in double precision, because single precision would round them.
+        # Vertices far from the origin are kept in double precision, because single precision would displace them.
         paths = replace(paths, vertex=table.vertex[table.kind != 0])
     if table.power is not None:
-        # In a null of the antennas, a path may have no power in replay and only a rounding error as its power in the
-        # engine.
+        # In a null of the antennas, a path may have zero power in replay while its power in the engine is only a
+        # rounding error.
         replayed = _without_nulls(paths)
         kept = np.flatnonzero((replayed > 0) | (table.power > ROUNDING * _free_space(paths)))
         power, replayed, table, paths = table.power[kept], replayed[kept], table.take(kept), take(paths, kept)
@@ -163,7 +163,7 @@ def powers(paths: Paths) -> NDArray[np.float64]:
 
 
 def _without_nulls(paths: Paths) -> NDArray[np.float64]:
-    """Power gain of every path in replay [P]; in a null of an antenna, 0 replaces the rounding error."""
+    """Power gain of every path in replay [P], with 0 instead of the rounding error in a null of an antenna."""
     gain = [(np.abs(field) ** 2).sum(axis=2).max(axis=1) for field in (paths.tx_field, paths.rx_field)]
     return np.where(np.minimum(*gain) > ROUNDING, powers(paths), 0.0)
 
@@ -174,7 +174,7 @@ def _free_space(paths: Paths) -> NDArray[np.float64]:
 
 
 def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
-    """The paths with normals and materials of surfaces, and the largest distance of a point from its surface [m]."""
+    """The paths with surface normals and materials, and the largest distance [m] of a point from its surface."""
     present = table.kind != 0
     stops = np.concatenate([table.tx[:, None], table.vertex, table.rx[:, None]], axis=1)
     stops[np.arange(len(stops)), present.sum(axis=1) + 1] = table.rx
@@ -232,7 +232,7 @@ def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
 
 
 def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
-    """Index of the stated material, or of the stated object's material; -1 if neither is stated [P, D]."""
+    """Index of every interaction's material, as stated or from the stated object [P, D]; -1 if neither is stated."""
     names = {name: index for index, name in enumerate(scene.materials)}
     by_object = {item.name: names[item.material] for item in scene.objects}
     index = np.full(table.kind.shape, -1)
@@ -257,7 +257,8 @@ def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
 
 
 def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
-    # The bend angle times the length of the shorter segment is the displacement of the end of this segment.
+    # The bend angle times the length of the shorter segment is the distance by which the bend displaces this segment's
+    # end.
     bend = np.linalg.norm(hits.leaving - hits.incident, axis=1) * hits.length
     if (transmits & (bend > 4 * TOLERANCE)).any():
         number = int(np.argmax(np.where(transmits, bend, 0)))
@@ -268,7 +269,7 @@ def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
 
 
 def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
-    """Refuse delays that contradict the lengths of the paths' segments [P, D + 1], [m]."""
+    """Refuse delays that contradict the lengths [P, D + 1], [m], of the paths' segments."""
     if table.delay is None:
         return
     length = segment.sum(axis=1)
@@ -286,7 +287,7 @@ def _check_delays(table: RayTable, segment: NDArray[np.float64]) -> None:
 def _assign_links(
     table: RayTable, links: Links | None
 ) -> tuple[LinkPositions, NDArray[np.int64], NDArray[np.int64] | None]:
-    """Ends of distinct links, link index of every path, and indices of the program's links (None without `links`).
+    """Ends of the distinct links, link index of every path, and indices of the program's links (None without `links`).
 
     Paths between positions that are not in `links` have the index -1.
 
@@ -294,7 +295,8 @@ def _assign_links(
         InputError: No path belongs to a link, or the paths of a link have different ends.
     """
     own = np.hstack([table.tx, table.rx])
-    # Without labels, nearly equal positions count as one position; rounding would separate a few of these positions.
+    # Without labels, nearly equal positions count as one position; comparing rounded positions would separate a few of
+    # them.
     label = join_positions(own) if table.link is None else _ranks(table.link)
     _, first, link = np.unique(label, return_index=True, return_inverse=True)
     link = link.reshape(-1)
@@ -324,7 +326,7 @@ def _assign_links(
 
 
 def _ranks(label: NDArray) -> NDArray[np.int64]:
-    """Ranks of the labels in sorted order [P]; digits in names are compared as numbers, so `rx2` precedes `rx10`."""
+    """Ranks of the labels in sorted order [P]; digits in labels are compared as numbers, so `rx2` precedes `rx10`."""
     names = np.unique(label).tolist()
     if label.dtype.kind not in "iu":
         names.sort(key=lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), name))
@@ -333,7 +335,7 @@ def _ranks(label: NDArray) -> NDArray[np.int64]:
 
 
 def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
-    """Refuse repeats of a path in a link, as in merged exports, because the power of the path would be added twice."""
+    """Refuse repeated paths of a link, as in merged exports, because their power would be added twice."""
     point = np.round(table.vertex, 3).reshape(len(link), 3 * table.kind.shape[1])
     rows = np.column_stack([link, table.kind, point])
     _, first, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
@@ -349,7 +351,7 @@ def _check_repeats(table: RayTable, link: NDArray[np.int64]) -> None:
 def _check_direct(
     table: RayTable, paths: Paths, power: NDArray[np.float64], replayed: NDArray[np.float64] | None
 ) -> None:
-    """Refuse a direct path with a power [P] that is implausible for its antennas.
+    """Refuse direct paths whose power is implausible for their antennas; `power` [P] is the power of every path.
 
     `replayed` is the power of every path in replay; None if the antennas are unknown.
 
@@ -361,7 +363,7 @@ def _check_direct(
     known, least = replayed is not None, ROUNDING * free_space
     expected = free_space if replayed is None else replayed
     off = 10 * np.log10(np.maximum(power, least) / np.maximum(expected, least))
-    # In a null of an antenna, no correction can restore the power.
+    # In a null of an antenna, where the replayed power is 0, no correction can restore the power.
     implausible = (np.abs(off) > FREE_SPACE_DB) | (expected == 0) if known else off > DIRECT_GAIN_DB
     wrong = direct & implausible
     if wrong.any():
@@ -393,7 +395,7 @@ def _check_direct(
 def _correction(
     table: RayTable, paths: Paths, power: NDArray[np.float64], replayed: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Ratio of the stated power of every path to its power in replay [P].
+    """Ratio of the stated power to the power in replay, for every path [P].
 
     Raises:
         InputError: A path has no power in replay.

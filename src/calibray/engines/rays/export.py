@@ -1,4 +1,4 @@
-"""The rays of one RT call, and an engine that keeps the rays of its calls."""
+"""The rays that one RT call returns, and an engine that keeps the rays of its calls."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 FAINT: Final = 0.1
-"""Constant that is added to every path's share of its link's power, so that weak paths keep a small weight."""
+"""Constant added to every path's share of its link's power, so that even the weakest paths have some weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Export:
     """The rays of one RT call.
 
     Attributes:
-        paths: The rays as a path program, whose powers at the scene's constants equal those of the engine.
+        paths: The rays as a path program, which reproduces the engine's powers at the scene's constants.
         level_db: Power of every path [P], [dB].
     """
 
@@ -73,7 +73,7 @@ class Export:
 
 @final
 class Exporting:
-    """An engine that returns rays, and keeps these rays so that each candidate requires only one call.
+    """An engine that returns rays and keeps them, so that each candidate requires only one call.
 
     Attributes:
         parameters: The parameters whose values a candidate contains.

@@ -1,4 +1,4 @@
-"""Paths of other programs as rows of a ray table: Wireless InSite, AODT, DeepMIMO and Sionna RT."""
+"""Conversion of other programs' paths to rows of a ray table: Wireless InSite, AODT, DeepMIMO and Sionna RT."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Polyline(NamedTuple):
 
     Attributes:
         points: Points from the transmitter to the receiver [n, 3], [m].
-        types: Types of the n - 2 interactions, with the values of the column `type`.
+        types: Types of the n - 2 interactions, named as in the column `type`.
         power_db: Path gain [dB].
         delay: Propagation delay [s]; NaN if not stated.
         materials: Names of the materials at the interactions, as in the column `hit_material`; empty if not stated.
@@ -47,11 +47,11 @@ class Polyline(NamedTuple):
 
 
 def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
-    """A ray table of the given paths, in the given order.
+    """A ray table with the given paths, in the given order.
 
     Raises:
-        InputError: The list is empty, a power is NaN, or the number of points of a path does not exceed the number of
-            interactions by two.
+        InputError: The list is empty, a power is NaN, or a path does not have exactly two more points than
+            interactions.
     """
     paths = list(paths)
     if not paths:
@@ -85,11 +85,11 @@ def rows_of(paths: Iterable[Polyline], source: str) -> SourceTable:
 
 
 def ray_rows(rays: Any, tx_power_dbm: float | None) -> SourceTable:
-    """The rows of a ray table, of a file that contains one, or of the paths of another program.
+    """The rows of a ray table, given as a table, as a file, or as the paths of another program.
 
     Raises:
-        InputError: The file or folder is malformed or of an unknown kind, or the transmitted power is missing, not a
-            finite number or not applicable.
+        InputError: The file or folder is malformed or of an unknown type, or the transmitted power is missing, is not a
+            finite number, or does not apply to these rays.
     """
     if tx_power_dbm is not None and not (isinstance(tx_power_dbm, Real) and np.isfinite(tx_power_dbm)):
         raise InputError(f"tx_power_dbm = {tx_power_dbm!r}: must be a finite number, in dBm")
@@ -132,11 +132,11 @@ INSITE_TYPES: Final = {"R": "reflection", "D": "diffraction", "DS": "diffuse", "
 
 
 INSITE_NAMES: Final = "*.paths.*.p2m"
-"""Names of the files with paths; the other files in a folder contain powers or delays of links."""
+"""Names of the files with paths; the other files in an export folder contain powers or delays of links."""
 
 
 def _insite_files(rays: Any) -> list[Path]:
-    """The files of Wireless InSite, which are given by name, in a list or by their folder; empty for other rays."""
+    """The files of Wireless InSite, given as a file, a list of files or their folder; empty for other rays."""
     if isinstance(rays, str | Path):
         if (path := Path(rays)).is_dir():
             others = is_deepmimo(path) or (path / AODT_FILES[0]).is_file()
@@ -148,13 +148,13 @@ def _insite_files(rays: Any) -> list[Path]:
 
 
 def read_insite(files: Sequence[Path], tx_power_dbm: float | None) -> SourceTable:
-    """Read the paths in text files `*.paths.*.p2m` of Remcom Wireless InSite, each with one transmitter.
+    """Read the paths from text files `*.paths.*.p2m` of Remcom Wireless InSite, each of which has one transmitter.
 
     Lines that begin with # are comments. The first line contains the number of receivers. Each receiver has a line with
-    its index and its number of paths, and a line of totals if it has any paths. Each path has a line of nine numbers
-    (index, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]), or of
-    eight numbers without the phase. The line of numbers is followed by a line such as Tx-R-D-Rx and by a line for each
-    point.
+    its index and its number of paths, followed by a line of totals if it has any paths. Each path has a line of nine
+    numbers (index, number of interactions, received power [dBm], phase [deg], time of arrival [s], four angles [deg]),
+    or of eight numbers without the phase. The line of numbers is followed by a line with the path's interactions, such
+    as Tx-R-D-Rx, and by one line for each point.
 
     Raises:
         InputError: The transmitted power is missing, a file does not exist or is malformed, or a path crosses foliage.
@@ -232,7 +232,7 @@ def _insite_numbers(file: Path, line: tuple[int, str], *counts: int) -> list[flo
 
 AODT_FILES: Final = ("raypaths.parquet", "cirs.parquet")
 AODT_UNIT: Final = 0.01
-"""Unit of length in an export [m]."""
+"""Unit of length in an export, in metres."""
 
 AODT_PAIR: Final = ["ru_id", "ue_id"]
 AODT_ELEMENT: Final = "ru_ant_el"
@@ -243,17 +243,19 @@ AODT_TYPES: Final = {
 
 
 def read_aodt(folder: Path) -> SourceTable:
-    """Read the first time step that has paths from an export folder of NVIDIA's Aerial Omniverse Digital Twin.
+    """Read an export folder of NVIDIA's Aerial Omniverse Digital Twin, at the first time step that has paths.
 
     The folder contains two tables, both of which state the time, the radio unit and the user equipment. `raypaths` has
-    a row for each path, with its points in units of the scene (centimetres) and its types of interactions. `cirs` has a
-    row for each pair of antenna elements, with lists of complex gains and delays [s] in the order of the paths.
+    a row for each path, with the path's points in units of the scene (centimetres) and the types of its interactions.
+    `cirs` has a row for each pair of antenna elements, with lists of complex gains and delays [s] in the order of the
+    paths.
 
     Powers are summed over the antenna elements of the user equipment and averaged over the antenna elements of the
     radio unit.
 
     Raises:
-        InputError: A table or column is missing or malformed, or a pair has different numbers of gains and paths.
+        InputError: A table or column is missing or malformed, or the number of gains of a pair differs from its number
+            of paths.
     """
     rays, gains = (read_table(folder / name) for name in AODT_FILES)
     for table, names in ((rays, ["points", "interaction_types"]), (gains, ["cir_re", "cir_im", "cir_delay"])):
@@ -303,7 +305,7 @@ def _aodt_response(
 
 
 def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
-    """The numbers in a list with one entry for each path."""
+    """The numbers in a list that has one entry for each path."""
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -317,7 +319,7 @@ def _aodt_numbers(source: str, name: str, values: Any) -> NDArray[np.float64]:
 
 
 def _aodt_element(element: Any) -> Any:
-    """An antenna element in hashable form; exports contain a number, a list or a dictionary (row, column, port)."""
+    """An antenna element in hashable form; exports state it as a number, a list or a dictionary (row, column, port)."""
     if isinstance(element, dict):
         return tuple(element.values())
     return tuple(element) if np.ndim(element) else element
@@ -352,11 +354,11 @@ def _aodt_types(table: SourceTable, types: Any) -> list[str]:
 
 DEEPMIMO_TYPES: Final = {"1": "reflection", "2": "diffraction", "3": "diffuse", "4": "transmission"}
 DEEPMIMO_OLD_NAMES: Final = {"delay": "toa", "inter_pos": "inter_loc", "tx_pos": "tx_loc", "rx_pos": "rx_loc"}
-"""Earlier names of matrices, by their present names."""
+"""Older names of matrices, by their present names."""
 
 
 def is_deepmimo(folder: Path) -> bool:
-    """Whether a folder contains the power matrices of a scenario."""
+    """Whether a folder contains the power matrices of a DeepMIMO scenario."""
     return any(_deepmimo_files(folder))
 
 
@@ -365,17 +367,17 @@ def read_deepmimo(folder: Path) -> SourceTable:
 
     For each transmitter and set of N receivers, there are six matrices: `power` [N, P], path gain [dB]; `delay` [N, P],
     [s]; `inter` [N, P], one digit for each interaction; `inter_pos` [N, P, I, 3], `tx_pos` [3] and `rx_pos` [N, 3],
-    [m]. Missing paths are NaN in all matrices.
+    [m]. In all matrices, NaN stands for a missing path.
 
     Raises:
-        InputError: A matrix is missing, malformed or too large, or the shapes of the matrices do not match.
+        InputError: A matrix is missing, malformed or too large, or the shapes of the matrices are inconsistent.
     """
     paths = [path for file in _deepmimo_files(folder) for path in _deepmimo_paths(file)]
     return rows_of(paths, str(folder))
 
 
 def _deepmimo_files(folder: Path) -> Iterator[Path]:
-    """The files of the power matrices."""
+    """The files that contain the power matrices."""
     for ending in ("mat", "npz"):
         yield from sorted(folder.glob(f"power_t*.{ending}"))
 
@@ -401,7 +403,7 @@ def _deepmimo_paths(file: Path) -> Iterator[Polyline]:
             f"{tx.shape} and {rx.shape}; power, delay and inter must be [N, P], inter_pos [N, P, I, 3], tx_pos [1, 3] "
             "and rx_pos [N, 3]"
         )
-    # A path with a delay and interactions counts as a path, so that a power of NaN is refused later.
+    # A path with a delay and interactions but a power of NaN also counts, so that it is refused later.
     exists = np.isfinite(inter) & (inter >= 0) & (np.isfinite(power) | np.isnan(power) & np.isfinite(delay))
     for receiver, path in np.argwhere(exists).tolist():
         codes = str(int(inter[receiver, path])) if inter[receiver, path] else ""
@@ -451,7 +453,7 @@ def is_sionna_paths(value: object) -> bool:
 
 
 def check_carrier(rays: Any, frequency: float) -> None:
-    """Refuse paths of Sionna RT solved at a carrier other than `frequency` [Hz]; other kinds of rays state no carrier.
+    """Refuse paths of Sionna RT solved at a carrier other than `frequency` [Hz]; no other rays state their carrier.
 
     Raises:
         InputError: The carriers differ.
@@ -468,10 +470,11 @@ def check_carrier(rays: Any, frequency: float) -> None:
 
 
 def read_sionna_paths(paths: Any) -> SourceTable:
-    """Read paths of Sionna RT in memory, as returned by its `PathSolver`, for arrays with a single antenna position.
+    """Read paths of Sionna RT in memory, as its `PathSolver` returns them, for arrays with a single antenna position.
 
-    The shape of vertices and interactions is [D, R, T, P] with synthetic arrays, and otherwise [D, R, Ra, T, Ta, P],
-    where Ra and Ta count the antennas of the arrays. Gains `a` are pairs of real and imaginary parts [R, Ra, T, Ta, P].
+    Vertices and interactions have the shape [D, R, T, P] with synthetic arrays, and otherwise [D, R, Ra, T, Ta, P],
+    where Ra and Ta are the numbers of antennas in the arrays. The gains `a` are a pair of arrays [R, Ra, T, Ta, P], the
+    real and the imaginary parts.
 
     Powers are summed over the ports of a receiver and averaged over the ports of a transmitter.
 
@@ -517,6 +520,6 @@ def _sionna_polylines(paths: Any) -> Iterator[Polyline]:
 
 
 def _sionna_positions(ends: Any, count: int) -> NDArray[np.float64]:
-    """Positions of the ends [count, 3]; Sionna RT lists ports at one position consecutively."""
+    """Positions of the links' ends [count, 3]; Sionna RT lists the ports at one position consecutively."""
     positions = np.array(ends, dtype=float).T
     return positions[:: len(positions) // count]

@@ -1,4 +1,4 @@
-"""The surface of every interaction in a ray table, with its normal and material, and the edge of every diffraction."""
+"""The surface, with normal and material, of every interaction in a ray table, and the edge of every diffraction."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from calibray.scenes import Scene
 from calibray.scenes.shapes import read_surface
 
 TOLERANCE: Final = 0.02
-"""Maximum distance of an interaction from its surface [m]; rounding to centimetres moves a point by at most 0.009 m."""
+"""Maximum distance [m] of an interaction from its surface; rounding to centimetres moves a point by at most 0.009 m."""
 
 SAME: Final = 1e-3
-"""Faces are considered coincident at a point if their distances from the point differ by less than this value [m]."""
+"""Faces count as coincident at a point if their distances from this point differ by less than this value [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,8 @@ class Surfaces:
 
     Attributes:
         corners: Corners of every triangle [F, 3, 3], [m].
-        normal: Unit normals, pointing to either side [F, 3].
-        material: Index of the material in `Scene.materials` [F].
+        normal: Unit normals [F, 3], which may point to either side.
+        material: Index of each face's material in `Scene.materials` [F].
     """
 
     corners: NDArray[np.float64]
@@ -57,7 +57,7 @@ class Surfaces:
     def near(
         self, point: NDArray[np.float64], within: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Find faces within a distance [m] of points [n, 3]; return indices of points and faces, and distances [k]."""
+        """Find all pairs of a point [n, 3] and a face within a distance [m]; return their indices and distances [k]."""
         pairs = list(self._box_pairs(point, within))
         index, face = (
             (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else np.zeros((2, 0), int)
@@ -69,14 +69,14 @@ class Surfaces:
         return index[close], face[close], distance[close]
 
     def distance(self, point: NDArray[np.float64], faces: NDArray[np.bool_]) -> float:
-        """Distance [m] of a point [3] from the nearest face in the mask `faces` [F]."""
+        """Distance [m] of a point [3] from the nearest of the faces that the mask `faces` [F] selects."""
         corners = self.corners[faces]
         nearest = _nearest(corners, np.broadcast_to(point, (len(corners), 3)))
         return float(np.linalg.norm(nearest - point, axis=1).min(initial=np.inf))
 
     def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
         low, high = self.corners.min(axis=1) - within, self.corners.max(axis=1) + within
-        # The points are tested in parts, each of which needs about 0.5 GB.
+        # The points are tested in batches, each of which needs about 0.5 GB.
         size = max(20_000_000 // max(len(low), 1), 1)
         for start in range(0, len(point), size):
             part = point[start : start + size, None]
@@ -95,12 +95,13 @@ class Hits:
         point: Positions [n, 3], [m].
         incident: Unit vectors of propagation before the interaction [n, 3].
         leaving: Unit vectors of propagation after the interaction [n, 3].
-        length: Length of the shorter of the two adjacent segments [n], [m].
-        reflects: Whether the law of reflection must hold [n].
-        diffracts: Whether an edge diffracts the wave; the edge's faces can have different materials [n].
-        material: Index of the stated material; -1 if none is stated [n].
-        preferred: Index of the material that is chosen where surfaces coincide; -1 if no material is preferred [n].
-        label: Names that messages use for the interactions [n].
+        length: Length [n], [m], of the shorter of the two adjacent segments.
+        reflects: Whether each interaction must obey the law of reflection [n].
+        diffracts: Whether each interaction is a diffraction [n], at an edge whose two faces can have different
+            materials.
+        material: Index of each interaction's stated material [n]; -1 if none is stated.
+        preferred: Index of the material that each interaction prefers where surfaces coincide [n]; -1 if none.
+        label: Names of the interactions in messages [n].
     """
 
     point: NDArray[np.float64]
@@ -114,32 +115,32 @@ class Hits:
     label: NDArray[np.str_]
 
     def mirror_error(self, index: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance of the path from a ray reflected at normals [k, 3], at the end of the shorter segment [k], [m]."""
+        """Distance [k], [m], of the path from a ray reflected at normals [k, 3], at the shorter segment's end."""
         incident = self.incident[index]
         mirrored = incident - 2 * np.sum(incident * normal, axis=1)[:, None] * normal
         return np.linalg.norm(mirrored - self.leaving[index], axis=1) * self.length[index]
 
 
 def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
-    """Index of every interaction's face [n], and the largest distance of an interaction from its face [m].
+    """Index of every interaction's face [n], and the largest distance [m] of an interaction from its face.
 
-    A reflection is assigned to the nearest face at which the path obeys the law of reflection. Any other interaction is
-    assigned to the nearest face. Except for diffractions, the face must have the stated material. `names` contains the
-    names of the materials.
+    A reflection is assigned to the nearest face at which the path obeys the law of reflection, and any other
+    interaction to the nearest face. Except for diffractions, this face must have the stated material. `names` contains
+    the names of the materials.
 
     Raises:
-        InputError: A point is not on a surface (of the stated material), faces of different materials coincide at a
-            point, or no surface reflects the wave in the direction of the path.
+        InputError: A point is not on a surface or not on one of the stated material, faces of different materials
+            coincide at a point, or no surface reflects the wave in the direction of the path.
     """
     index, face, distance = surfaces.near(hits.point, TOLERANCE)
     free = (hits.material < 0) | hits.diffracts
     right = free[index] | (hits.material[index] == surfaces.material[face])
     index, face, distance = index[right], face[right], distance[right]
     error = hits.mirror_error(index, surfaces.normal[face])
-    # A point displaced by the tolerance changes the directions of both segments.
+    # Displacing a point by the tolerance changes the directions of both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
-    # For each point, faces that satisfy the law of reflection come first, in order of distance.
-    # Among coincident faces, faces of the preferred material come first.
+    # For each point, faces at which the law of reflection is satisfied come first, in order of distance. Among
+    # coincident faces, faces of the preferred material come first.
     preferred = surfaces.material[face] == hits.preferred[index]
     order = np.lexsort((distance - SAME * preferred, bent, index))
     index, face, distance, bent = index[order], face[order], distance[order], bent[order]
@@ -195,9 +196,9 @@ class Edge:
     """The wedge of a diffraction.
 
     Attributes:
-        face: The 0-face, which the wave illuminates.
+        face: Index of the 0-face, which the wave illuminates.
         normal_0: Outward normal of the 0-face [3].
-        normal_n: Outward normal of the other face [3].
+        normal_n: Outward normal of the n-face, the other face [3].
         direction: Unit vector e along the edge [3]; the cross product normal_0 x e points into the 0-face.
         error: Deviation of the path from Keller's law, as a displacement [m].
     """
@@ -210,7 +211,7 @@ class Edge:
 
 
 def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
-    """The edge of a diffraction: of all pairs of faces at the point, the pair that best satisfies Keller's law.
+    """The edge of a diffraction, formed by the two faces at the point that best satisfy Keller's law.
 
     Raises:
         InputError: No two faces at the point form an edge that diffracts the wave in the direction of the path.
@@ -223,37 +224,36 @@ def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
             f"{hits.label[number]}: no edge of the scene diffracts the wave in the direction of the path at this "
             "point; check the vertex, or remove the path"
         )
-    # Among pairs with equal errors, the pair is used whose 0-face the wave meets at the angle closest to normal
-    # incidence.
+    # Of several pairs with equal errors, the one is used whose 0-face the wave meets closest to normal incidence.
     return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(hits.incident[number], edge.normal_0)))
 
 
 def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -> Edge | None:
-    """The wedge of a 0-face and an n-face; None if the faces form no wedge around which the path bends."""
+    """The wedge formed by a 0-face and an n-face; None if the path does not bend around such a wedge."""
     point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
     normal_0, normal_n = surfaces.normal[list(faces)]
     direction = np.cross(normal_0, normal_n)
-    # The norm is the sine of the angle between the normals: nearly coplanar faces form no edge.
+    # The norm of this vector is the sine of the angle between the normals; nearly coplanar faces form no edge.
     if hits.material[number] not in (-1, surfaces.material[faces[0]]) or np.linalg.norm(direction) < 0.05:
         return None
     into_0, into_n = surfaces.corners[list(faces)].mean(axis=1) - point
-    # Outward normals point away from the other face.
+    # An outward normal points away from the other face.
     normal_0 = -normal_0 * np.sign(np.dot(into_n, normal_0))
     normal_n = -normal_n * np.sign(np.dot(into_0, normal_n))
     direction /= np.linalg.norm(direction)
     # Sionna RT measures azimuths from the tangent n_0 x e, which points into the 0-face.
     direction *= np.sign(np.dot(np.cross(normal_0, direction), into_0))
-    # A ray behind both faces runs inside the wedge, but the wave must meet the 0-face from outside.
+    # A ray behind both faces would run inside the wedge. The wave must also meet the 0-face from outside.
     inside = [np.dot(end, normal_0) < 0 and np.dot(end, normal_n) < 0 for end in (-incident, leaving)]
     if any(inside) or np.dot(incident, normal_0) > 0 or not direction.any():
         return None
-    # Keller's law: both rays make the same angle with the edge.
+    # Keller's law: the incident and the diffracted ray make the same angle with the edge.
     error = abs(np.dot(incident - leaving, direction)) * hits.length[number]
     return Edge(faces[0], normal_0, normal_n, direction, float(error))
 
 
 def _nearest(corners: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """For each point [k, 3], the nearest point [k, 3] of a triangle with corners [k, 3, 3], [m]."""
+    """For each point [k, 3], [m], the nearest point [k, 3] on the triangle with the given corners [k, 3, 3]."""
     from trimesh.triangles import (
         closest_point,
     )  # the import takes 0.2 s, and only rays of other programs need it

@@ -1,7 +1,7 @@
-"""A ray table: one row for each point of a path, from the transmitter via the interactions to the receiver.
+"""A ray table: one row for each point of every path, from the transmitter via the interactions to the receiver.
 
 `docs/reference/ray-table.md` documents the columns. Rows can be in any order, because every row states its path and the
-number of its point on the path. The file extension determines the format: CSV, Parquet, JSON or HDF5.
+number of its point on this path. The file extension determines the format: CSV, Parquet, JSON or HDF5.
 """
 
 from __future__ import annotations
@@ -33,19 +33,18 @@ TYPES: Final = {
     "transmission": Kind.REFRACTION,
     "diffraction": Kind.DIFFRACTION,
 }
-"""Kinds of interaction by their names in the column `type`."""
+"""Kinds of interaction, by their names in the column `type`."""
 
 ENDS: Final = ("transmitter", "receiver")
-"""Values of `type` at the first and the last point of a path."""
+"""Values of the column `type` at the first and the last point of a path."""
 
 REQUIRED: Final = ("path", "point", "type", "x", "y", "z")
 POWERS: Final = ("power_db", "gain_real", "gain_imag")
 OPTIONAL: Final = ("material", "object", "link", "delay", *POWERS)
-"""Optional columns of a table; unknown names are compared with these columns, because a misspelt name would be
-ignored."""
+"""Optional columns of a table. Unknown names are compared with these, because a misspelt column would be ignored."""
 
 HIT_MATERIAL: Final = "hit_material"
-"""Optional column like `material`, which is used only where surfaces of different materials coincide."""
+"""Optional column with a material, which is used only where surfaces of different materials coincide."""
 
 QUANTITIES: Final = {
     "gain_real": r"\b(re|real)\b",
@@ -54,15 +53,15 @@ QUANTITIES: Final = {
     "delay": "delay",
     "material": "material",
 }
-"""For each column, the pattern of unknown names that probably refer to this column; separators in a name are read as
-blanks."""
+"""For each column, a pattern that matches unknown names which probably refer to this column. Separators in a name are
+treated as blanks."""
 
 MISSPELT: Final = 0.8
-"""Minimum similarity at which an unknown name is considered a misspelt column; `line` is not considered a misspelt
+"""Minimum similarity at which an unknown name counts as a misspelt column; `line` does not count as a misspelt
 `link`."""
 
 MOST_POINTS: Final = RANGES["max_depth"][1] + 2
-"""Maximum number of points of a path: the maximum number of interactions in a trace, plus both ends."""
+"""Maximum number of points on a path: the maximum number of interactions in a trace, plus the two ends."""
 
 NO_POWER: Final = {"power_db": "-inf (-10000 in JSON)", "gain_real": "0", "gain_imag": "0"}
 """Values of the power columns for a path without power."""
@@ -78,16 +77,16 @@ class RayTable:
     Attributes:
         source: Name of the table, for messages.
         path: Number or label of every path [P].
-        link: Number or label of every path's link [P]; None if the ends of a path determine its link.
+        link: Number or label of every path's link [P]; None if each path's link is determined by its ends.
         tx: Transmitter position of every path [P, 3], [m].
         rx: Receiver position of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        kind: Kinds of interaction [P, D]; 0 after the last interaction.
-        material: Names of materials, empty where not stated [P, D].
-        object: Names of objects, empty where not stated [P, D].
-        hit_material: Names of materials, used only where surfaces coincide; empty where not stated [P, D].
-        power: Path gain [P]; 0 for an absent path, None if not stated.
-        delay: Propagation delay [P], [s]; None if not stated.
+        kind: Kind of every interaction [P, D]; 0 after a path's last interaction.
+        material: Name of every interaction's material [P, D]; empty if not stated.
+        object: Name of every interaction's object [P, D]; empty if not stated.
+        hit_material: Name of the material to use where surfaces coincide [P, D]; empty if not stated.
+        power: Path gain of every path [P]; 0 for an absent path; None if not stated.
+        delay: Propagation delay of every path [P], [s]; None if not stated.
     """
 
     source: str
@@ -105,7 +104,7 @@ class RayTable:
 
     @classmethod
     def of(cls, table: SourceTable, axes: str = "x y z") -> RayTable:
-        """Read paths from rows; `axes` lists the table axes that become the scene's x, y and z, such as "x -z y".
+        """Read paths from rows; `axes` lists the table's axes that become the scene's x, y and z, such as "x -z y".
 
         Raises:
             InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
@@ -151,7 +150,7 @@ class RayTable:
         )
 
     def take(self, index: NDArray[np.int64]) -> RayTable:
-        """The table with the paths at the indices [n], in this order."""
+        """The table with the paths at the given indices [n], in the order of the indices."""
         taken = {
             item.name: value[index]
             for item in fields(self)
@@ -160,7 +159,7 @@ class RayTable:
         return replace(self, **taken)
 
     def frame(self) -> pd.DataFrame:
-        """The table with one row for each point."""
+        """The table as rows, one for each point."""
         number = np.arange(len(self.path))
         inner = self.kind != 0
         depth = inner.sum(axis=1)
@@ -196,7 +195,7 @@ def _checked_rows(table: SourceTable) -> SourceTable:
 
 
 def _with_known_names(table: SourceTable) -> SourceTable:
-    """The table with the documented names of its known columns; names that appear to be misspelt are refused."""
+    """The table with its known columns renamed as documented; names that appear to be misspelt are refused."""
     known = (*REQUIRED, *OPTIONAL, HIT_MATERIAL)
     given = [str(name) for name in table.frame]
     names = [name if (name := _plain(text)) in known else text for text in given]
@@ -225,7 +224,7 @@ def _plain(name: str) -> str:
 
 
 def _meant(name: str, absent: set[str]) -> str | None:
-    """The absent column that an unknown name probably refers to; None if there is no such column."""
+    """The absent column to which an unknown name probably refers; None if there is no such column."""
     words = re.sub(r"[\W_]+", " ", name.casefold())
     for known, pattern in QUANTITIES.items():
         if known in absent and re.search(pattern, words):
@@ -236,7 +235,7 @@ def _meant(name: str, absent: set[str]) -> str | None:
 def _kinds(
     table: SourceTable, row_path: NDArray[np.int64], step: NDArray[np.int64], count: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Kind of every row [rows], 0 at the ends of a path; unknown types and paths without both ends are refused."""
+    """Kind of every row [rows]; 0 at the ends of a path. Refuses unknown types and paths without both ends."""
     stated = table.labels("type")
     kinds = np.char.lower(np.char.strip(stated))
     known = [*ENDS, *TYPES]
@@ -278,7 +277,7 @@ def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
 
 
 def _optional_labels(table: SourceTable, name: str) -> NDArray:
-    """Labels of a column; empty if a label or the column is missing [rows]."""
+    """Labels of a column [rows]; empty where a label, or the whole column, is missing."""
     labels = np.full(len(table), "", dtype=object)
     if name in table.frame:
         present = table.frame[name].notna().to_numpy()
@@ -287,31 +286,31 @@ def _optional_labels(table: SourceTable, name: str) -> NDArray:
 
 
 def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
-    """Number or label of the link of every path [P]."""
+    """Number or label of every path's link [P]; None if the table states no links."""
     if "link" not in table.frame:
         return None
     return _names(SourceTable(_stated(table, "link", row_path).to_frame("link"), source=table.source), "link")
 
 
 def _names(table: SourceTable, name: str) -> NDArray:
-    """Values of a column [rows]: integers if possible, which sort as numbers, and otherwise labels."""
+    """Values of a column [rows]: integers if possible, because these sort as numbers, and otherwise labels."""
     column = table.column(name)
     if pd.api.types.is_integer_dtype(column) and not column.isna().any():
         return column.to_numpy()
-    # MATLAB stores whole numbers as floats, and pandas does so if any row is empty.
+    # MATLAB always stores whole numbers as floats; pandas does so if any row is empty.
     if pd.api.types.is_float_dtype(column) and ((column % 1 == 0) & (column.abs() < 2**53)).all():
         return table.numbers(name).astype(np.int64)
     return table.labels(name)
 
 
 def _per_path(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> NDArray[np.float64]:
-    """A number that applies to the whole path [P]."""
+    """Numbers that apply to whole paths [P]."""
     numbers = table.assign(**{name: table.numbers(name, gaps=True)})
     return _stated(numbers, name, row_path).to_numpy(np.float64)
 
 
 def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Series:
-    """A value for the whole path, which must be the same in all rows that state the value [P]."""
+    """Values that apply to whole paths [P]; all rows of a path that state the value must agree."""
     groups = table.column(name).groupby(row_path)
     number = groups.nunique().to_numpy()
     row = int(np.argmax((number != 1)[row_path]))
@@ -354,13 +353,13 @@ def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float6
 
 
 LARGEST_JSON: Final = 2**26
-"""Maximum size of a JSON file [bytes]; in memory, the numbers occupy about twenty times as much."""
+"""Maximum size of a JSON file [bytes]; in memory, its numbers occupy about twenty times as much."""
 
 HDF5: Final = b"\x89HDF"
 """First bytes of an HDF5 file."""
 
 LARGEST_ARRAYS: Final = 2**30
-"""Maximum size of datasets or matrices in memory [bytes]; a limit is needed because kilobytes can unpack to gigabytes.
+"""Maximum size of datasets or matrices in memory [bytes], needed because kilobytes can unpack to gigabytes.
 """
 
 
@@ -402,7 +401,7 @@ def parse_rays(content: bytes, source: str) -> SourceTable:
 
 
 def columns_table(columns: Mapping[Any, Any], source: str) -> SourceTable:
-    """The rows of a table in memory, given as one list per column.
+    """The rows of a table that is given in memory as one list per column.
 
     Raises:
         InputError: The columns have different lengths, or there are no rows.
@@ -426,7 +425,7 @@ def _parsed(content: Path | BytesIO | str | Mapping[Any, Any], source: str) -> S
 
 
 def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = False) -> None:
-    """Write the rows as .csv, .parquet, .json or .h5; an existing file is replaced only once the new file is complete.
+    """Write the rows as .csv, .parquet, .json or .h5. An existing file is replaced only when the new file is complete.
 
     Raises:
         InputError: The file extension is unknown, or the file cannot be written or must not be replaced.
