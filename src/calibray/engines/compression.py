@@ -74,8 +74,8 @@ class Compressed:
     Attributes:
         paths: The compressed program of the same links. The weights are included in the spreading factors of its paths.
             The compressed program is therefore valid only for sums of powers, not for delays or sums of fields.
-        error_db: Largest difference in path loss between the compressed and the full program at the checked candidates
-            [L], [dB].
+        error_db: Largest difference [L], [dB], between the path loss of the compressed and of the full program at the
+            checked candidates.
         candidates: Number of candidates, none of them used in the fit, at which every compressed link was checked.
     """
 
@@ -145,7 +145,7 @@ def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
 
 
 def _candidate_sets(parameters: Parameters) -> list[NDArray[np.float64]]:
-    """Training candidates, which include corners of the bounds, followed by the candidates of each check [n, d].
+    """Sets of candidates [n, d]: first for training, including the corners of the bounds, then for each check.
 
     A fit is least accurate where it extrapolates. In half of the candidates of each check, every parameter is therefore
     set to one of its bounds with probability one half.
@@ -218,7 +218,7 @@ class _Powers:
         self._powers: dict[int, NDArray[np.float64]] = {}
 
     def at(self, set_index: int, paths: slice) -> NDArray[np.float64]:
-        """Powers of a slice of the paths at one set of candidates [n, paths]."""
+        """Powers [n, paths] of a slice of the paths at one set of candidates."""
         if set_index not in self._powers:
             tables = self._tables[set_index].astype(np.float32)
             powers = [np.asarray(path_powers(self._program, table)) for table in tables]
@@ -258,7 +258,7 @@ def sparse_weights(
     """Sparse weights w >= 0 [P] with sum_p w_p share_p = 1 in every row of `share` [n, P].
 
     The residual of every row is within `bound` if non-negative weights can achieve this. The search starts from the
-    paths `first`.
+    paths with the indices `first`.
     """
     norm = np.linalg.norm(share, axis=0)
     unit = share / np.where(norm > 0, norm, 1.0)

@@ -51,7 +51,7 @@ class PoseError:
 
     Attributes:
         basis: Direction of departure of every path with its basis vectors [3, 3, P]; see `wave_basis`.
-        axis: Theta vector of every path in the frame of its first interaction [P, 2].
+        axis: Theta vector [P, 2] of every path, in the frame of its first interaction.
         pose: Stated orientations [M], each shared by several paths.
         mounted: Index of every path's pose [P].
         of_antenna: Indices of the paths of each antenna.

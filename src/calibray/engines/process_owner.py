@@ -25,7 +25,8 @@ class ProcessOwner:
 
     Attributes:
         host: The machine.
-        namespace: The process namespace, because each container numbers its processes separately; empty if unknown.
+        namespace: The process namespace; needed because each container numbers its processes separately; empty if
+            unknown.
         pid: The process number.
         started: Start time of the process [s since boot, or since 1970 if `boot` is unknown]; needed because process
             numbers are reused.

@@ -77,10 +77,10 @@ class Responses:
 
     Attributes:
         path_loss: Path loss [n, L], [dB]; +inf for a link without a path.
-        observed: K further observables [n, K, L], in SI units; NaN for a link without a value.
-        loss_slope: Derivatives of path loss with respect to the parameters [n, L, d]; None if not requested.
-        observed_slope: Derivatives of the further observables [n, K, L, d]; None if not requested. These derivatives
-            are NaN for a link without a value.
+        observed: Values [n, K, L] of K further observables, in SI units; NaN for a link without a value.
+        loss_slope: Derivatives [n, L, d] of path loss with respect to the parameters; None if not requested.
+        observed_slope: Derivatives [n, K, L, d] of the further observables; NaN for a link without a value. None if not
+            requested.
     """
 
     path_loss: NDArray[np.float64]
@@ -299,8 +299,8 @@ class Observable:
         unit: Unit of the values.
         measured: Function that maps links to measured values [L].
         modelled: Function that maps an engine and candidates [n, d] to values [n, L]; +inf for a link without a path.
-        derivatives: Function that maps an engine and candidates to values [n, L] and their derivatives with respect to
-            the parameters [n, L, d]; None if there are no derivatives.
+        derivatives: Function that maps an engine and candidates [n, d] to values [n, L] and their derivatives [n, L, d]
+            with respect to the parameters; None if there are no derivatives.
     """
 
     name: str

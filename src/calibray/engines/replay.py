@@ -66,7 +66,7 @@ class Replay:
         parameters: The parameters whose values a candidate contains.
         combining: How a link's paths are combined: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        effects: Effects on the paths, which list the paths in the order of `paths`.
+        effects: Effects on the paths, in which the paths have the same order as in `paths`.
         computation: Precision, tables and batch size.
 
     Raises:

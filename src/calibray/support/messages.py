@@ -51,7 +51,7 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 def printable(text: str, keep: str = "") -> str:
     r"""Escape all characters that a terminal or an editor would interpret, because a text may quote names from files.
 
-    Characters in `keep`, such as line breaks, are left unchanged. All others become Python escape sequences.
+    Each of these characters becomes a Python escape sequence, except the characters in `keep`, such as line breaks.
 
     Example:
         >>> printable("RSS\x1b[2J\n[engine]")

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""A function of the stage ("tracing", "calibrating", ...), the amount done, and the total amount (None if unknown). The
-name of the stage can be followed by a colon and an interim result: "calibrating: best RMSE 3.10 dB".
+"""A function of the stage ("tracing", "calibrating", ...), the amount done, and the total amount (None if unknown).
+
+The name of the stage can be followed by a colon and an interim result: "calibrating: best RMSE 3.10 dB".
 """
 
 

@@ -111,7 +111,7 @@ def dotted(path: Sequence[str | int]) -> str:
 
 
 def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
-    """Remove type names from the location of a Pydantic error; only the last key may be missing in the content."""
+    """Remove type names from the location of a Pydantic error; only the last key may be missing from the content."""
     path: list[str | int] = []
     for index, part in enumerate(location):
         last = index == len(location) - 1

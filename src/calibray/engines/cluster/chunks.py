@@ -1,7 +1,7 @@
 """Division of links into chunks, work that a worker does once per chunk (tracing, prediction), and chunked replay.
 
 The division, and thus every result, depends only on the links and the study, not on the number or type of workers.
-A later command can therefore read from the cache the chunks that an earlier command traced. For replay, each chunk is
+Chunks traced by one command can therefore be read from the cache by a later command. For replay, each chunk is
 traced and compiled on one worker, which keeps the chunk. Candidates are sent to the workers, which return the path loss
 of their chunks. With `reducing`, the workers return only a few sums, regardless of the number of links.
 """
@@ -63,7 +63,7 @@ _LATEST: Final[deque[Shared[Any]]] = deque(maxlen=1)
 class Shared(Generic[Content]):
     """Content that all chunks share, for example an opened study. Each process unpacks the content once.
 
-    A shared study needs only a few links of its own, because each chunk brings its own links.
+    A shared study needs to contain only a few links, because each chunk brings its own.
     """
 
     def __init__(self, content: Content) -> None:

@@ -109,7 +109,7 @@ class InProcess:
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a function on the objects of every chunk; see `Workers.ask`."""
+        """Call a function for every chunk, with the objects kept for it; see `Workers.ask`."""
         handles = [handle for handle in kept if isinstance(handle, _KeptHere)]
         answers = []
         for index in range(len(handles[0])):
@@ -219,7 +219,7 @@ class LocalWorkers:
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a function on the objects of every chunk; see `Workers.ask`."""
+        """Call a function for every chunk, with the objects kept for it; see `Workers.ask`."""
         handles = [handle for handle in kept if isinstance(handle, _KeptInProcesses)]
         with self._lock:
             try:
@@ -388,7 +388,7 @@ def _sendable(error: Exception) -> Exception:
 
 
 def _pin(home: int, count: int) -> None:
-    """Assign its share of the cores to a process before any library that counts cores is loaded.
+    """Assign a process its share of the cores before any library that counts cores is loaded.
 
     Otherwise, the thread pools of Dr.Jit and XLA in every process would use all cores and slow each other down.
     """

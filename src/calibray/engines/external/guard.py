@@ -3,9 +3,8 @@
 The guard is a separate script, `python -I -S guard.py LIBRARIES TIMEOUT FOLDER WORD...`, that imports no part of
 Calibray. There are two reasons to run the guard as a process between Calibray and the program. First, on Linux the
 guard adopts orphaned processes (PR_SET_CHILD_SUBREAPER), so it finds processes that left the program's process group
-and session.
-Second, the guard outlives Calibray: when its standard input ends because Calibray ended or stopped the call, the guard
-kills the program and removes the folder.
+and session. Second, the guard outlives Calibray: when its standard input ends because Calibray ended or stopped the
+call, the guard kills the program and removes the folder.
 
 The guard prints one JSON object with the keys `ended` ("status", "timeout", "stopped" or "unstarted"), `status` and
 `output`.

@@ -71,7 +71,7 @@ class CommandSection(EngineSection):
         return [*self.command, *(["rays"] if self.rays else [])]
 
     def program_files(self, study: OpenedStudy) -> dict[str, str]:
-        """SHA-256 of each file, by name, that the command line names and that lies in the study's folder."""
+        """SHA-256, by name, of each file on the command line that lies in the study's folder."""
         folder = study.source.resolve().parent
         files = {word: folder / word for word in self.command if exists(folder / word)}
         return {word: file_digest(file) for word, file in files.items() if file.is_relative_to(folder)}
@@ -95,7 +95,7 @@ class Command:
 
     If all attempts of a call fail, only the candidate of this call is lost: all its links count as links without a
     path. The run ends if every candidate of the first batch fails or if `give_up_after` successive calls fail, because
-    the program itself is then probably at fault.
+    the program is then probably faulty.
 
     Args:
         program: The program, with the settings of its calls.

@@ -38,8 +38,8 @@ class ReplaySection(EngineSection):
         compress_db: Maximum error in path loss [dB] when a few weighted paths replace all paths; None to replay all
             paths.
         chunk_links: Maximum number of links that are traced and replayed together. If None, all links are traced
-            together unless workers are given. With workers, the default is `chunks.CHUNK_LINKS`, raised where necessary
-            to keep the number of chunks at or below `chunks.MOST_CHUNKS`.
+            together, unless workers are given. With workers, the default is `chunks.CHUNK_LINKS`, raised where
+            necessary to keep the number of chunks at or below `chunks.MOST_CHUNKS`.
         rays: Ray table with the paths of another engine, which are used instead of traced paths.
     """
 

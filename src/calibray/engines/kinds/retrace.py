@@ -116,7 +116,7 @@ class Retrace:
             yield Answer(index, loss, time.perf_counter() - started)
 
     def _trace(self, carrier: CarrierTracer, candidate: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of a carrier's links for one candidate [l], [dB]."""
+        """Path loss [l], [dB], of a carrier's links for one candidate."""
         from calibray import fields
 
         tracer = carrier.tracer

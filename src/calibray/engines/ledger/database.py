@@ -129,7 +129,7 @@ def _renew(file: Path, run: str, ended: Event) -> None:
 
 
 RANGE_DB: Final = (-100.0, 10_000.0)
-"""Range of path loss [dB] that no engine's answer exceeds; values outside this range indicate damage."""
+"""Range of the path loss [dB] in any valid answer; values outside this range indicate damage."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -213,7 +213,7 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, database.LedgerEntry]],
     ) -> str:
-        """Write answers missing in the ledger to a rescue file, and return a sentence with the file's path."""
+        """Write answers missing from the ledger to a rescue file, and return a sentence with the file's path."""
 
         def fill(connection: sqlite3.Connection) -> None:
             database.set_up(connection, self.path)
@@ -274,7 +274,7 @@ class Ledger:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """Convert SQLite errors to errors with a remedy."""
+        """Convert an SQLite error to an EngineError that states a remedy."""
         try:
             yield
         except sqlite3.Error as error:

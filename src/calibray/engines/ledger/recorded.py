@@ -26,7 +26,7 @@ from calibray.support.progress import Progress
 _LOG: Final = logging.getLogger(__name__)
 SHORTEST_WAIT: Final = 0.02
 LONGEST_WAIT: Final = 1.0
-"""Minimum and maximum intervals between checks for the answers of another run [s]."""
+"""Minimum and maximum interval [s] between checks for answers from another run."""
 
 
 @final

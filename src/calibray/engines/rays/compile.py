@@ -39,8 +39,8 @@ correction accounts for the gain of the real antenna.
 """
 
 FREE_SPACE_DB: Final = 1.0
-"""Maximum deviation of a direct path from free-space power if the antennas are known [dB]. The pattern tables of
-different engines differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes
+"""Maximum deviation [dB] of a direct path's power from free-space power if the antennas are known. The pattern tables
+of different engines differ by tenths of a decibel. A wrong transmitted power, or watts instead of decibels, causes
 deviations of tens of decibels.
 """
 
@@ -60,7 +60,7 @@ corresponds to 18 dBi at one end and 7 dBi at the other.
 
 @dataclass(frozen=True, eq=False)
 class RaySetting:
-    """What is needed, besides the table, to compile the paths of a ray table.
+    """The inputs, other than the table itself, for compiling the paths of a ray table.
 
     Attributes:
         scene: The scene, with the constants that the engine used.

@@ -57,7 +57,7 @@ class Surfaces:
     def near(
         self, point: NDArray[np.float64], within: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Find all pairs of a point [n, 3] and a face within a distance [m]; return their indices and distances [k]."""
+        """Find the pairs of a point [n, 3] and a face at most `within` [m] apart; return indices and distances [k]."""
         pairs = list(self._box_pairs(point, within))
         index, face = (
             (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else np.zeros((2, 0), int)

@@ -297,7 +297,7 @@ def _names(table: SourceTable, name: str) -> NDArray:
     column = table.column(name)
     if pd.api.types.is_integer_dtype(column) and not column.isna().any():
         return column.to_numpy()
-    # MATLAB always stores whole numbers as floats; pandas does so if any row is empty.
+    # MATLAB stores whole numbers as floats; pandas does so only if any row is empty.
     if pd.api.types.is_float_dtype(column) and ((column % 1 == 0) & (column.abs() < 2**53)).all():
         return table.numbers(name).astype(np.int64)
     return table.labels(name)
