@@ -66,7 +66,7 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
 parameter is "region:trees.specific_attenuation"."""
 
 ROUGHNESS: Final = "roughness_mm"
-"""Field of a material that describes an effect on paths, not a constant."""
+"""Field of a material that describes an effect on paths instead of a constant."""
 
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
@@ -95,8 +95,8 @@ class Parameter:
         upper: Upper bound, in the unit of the field.
         start: Value before calibration, in the unit of the field; it must be within the bounds.
         scale: "linear", or "log" for a parameter that spans decades and has a positive lower bound.
-        at_lower: Length of an interval of the search space that maps to the value `lower`. A prior then gives this
-            value a non-zero probability.
+        at_lower: Length of the interval of the search space that maps to the value `lower`. With such an interval, a
+            prior gives this value a non-zero probability.
 
     Raises:
         InputError: The field is unknown, the bounds and the start value are out of order, or one of these values is
@@ -165,9 +165,9 @@ class Parameter:
 
 
 SCATTERING_SPREAD: Final = 0.25
-"""Standard deviation of a Gaussian. The positive half of this Gaussian is the prior of a scattering coefficient that is
-0 in the scene, if the true value is not exactly 0. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti
-et al., IEEE Trans. Antennas and Propagation 55, 2007)."""
+"""Standard deviation of a Gaussian. If a scattering coefficient is 0 in the scene but its true value is not exactly 0,
+the positive half of this Gaussian is its prior. Facades have scattering coefficients of 0.2 to 0.4 (V. Degli-Esposti et
+al., IEEE Trans. Antennas and Propagation 55, 2007)."""
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:

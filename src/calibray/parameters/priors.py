@@ -16,7 +16,7 @@ from calibray.parameters.space import Parameters
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Gaussian priors on the logarithms of k parameters, or on the values for parameters in `linear`.
+    """Gaussian priors on the logarithms of k parameters or, for parameters in `linear`, on the values.
 
     Attributes:
         index: Indices of the parameters that have a prior.
@@ -44,9 +44,10 @@ class LogNormal:
         return len(self.index)
 
     def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
-        """These priors, extended by independent log-normal priors of further parameters with a common spread.
+        """These priors and, for further parameters, independent log-normal priors with a common spread.
 
-        The priors of scattering coefficients that are centred on 0 have the standard deviation `SCATTERING_SPREAD`.
+        A prior centred on 0, which only scattering coefficients can have, has the standard deviation
+        `SCATTERING_SPREAD`.
         """
         return replace(
             self,
@@ -60,7 +61,7 @@ class LogNormal:
         )
 
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Least-squares residuals of the priors: (log value - log centre) / spread [n, k].
+        """Least-squares residuals [n, k] of the priors: (log value - log centre) / spread.
 
         The candidates [n, d] are in the units of the fields. Their values are positive, except for parameters in
         `linear`.
@@ -73,7 +74,7 @@ class LogNormal:
         return np.where(linear, values - centre, logarithm) / self.spread
 
     def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the residuals with respect to the parameters [n, k, d].
+        """Derivatives [n, k, d] of the residuals with respect to the parameters.
 
         The arguments are those of `residuals`.
         """
@@ -87,7 +88,7 @@ class LogNormal:
     def log_normalization(
         self, candidates: NDArray[np.float64], parameters: Parameters
     ) -> NDArray[np.float64]:
-        """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
+        """Logarithm [n] of the integral of exp(-residual^2 / 2) between the bounds of the parameters in `like`.
 
         The integral depends on the parameters on which these priors are centred. The variables of integration are the
         search coordinates.
@@ -105,7 +106,7 @@ class LogNormal:
     def draw_like(
         self, candidates: NDArray[np.float64], parameters: Parameters, random: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Candidates [n, d], in which the parameters in `like` are drawn around the parameters on which they depend."""
+        """Candidates [n, d] in which each parameter in `like` is drawn around the one on which its prior is centred."""
         drawn = candidates.copy()
         for row, reference in self._pairs:
             middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
@@ -120,7 +121,7 @@ class LogNormal:
     def _interval(
         self, row: int, reference: NDArray[np.float64], parameters: Parameters
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-        """Mean of the logarithm [n], and distance of each bound from this mean, in standard deviations [n].
+        """Mean of the logarithm [n], and distance [n] of each bound from this mean, in standard deviations.
 
         The last result is 1 if the search coordinate is the value itself, which shifts the mean, and 0 if it is the
         logarithm.
@@ -133,7 +134,7 @@ class LogNormal:
 
     @property
     def _pairs(self) -> tuple[tuple[int, int], ...]:
-        """Index of each prior in `like`, and index of the parameter on which the prior is centred."""
+        """For each pair in `like`: index of the prior, and index of the parameter on which the prior is centred."""
         return tuple((self.index.index(parameter), reference) for parameter, reference in self.like)
 
     @property

@@ -121,7 +121,7 @@ class Parameters:
         return np.array([parameter.scale == "log" for parameter in self.items])
 
     def named(self, candidate: ArrayLike) -> dict[str, float]:
-        """The values of a candidate [parameters], by parameter name."""
+        """The values of a candidate [parameters], keyed by parameter name."""
         return dict(zip(self.names, self._components(candidate).tolist(), strict=True))
 
     @cached_property
@@ -169,8 +169,8 @@ class Parameters:
     def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
         """The constants that the parameters determine at one carrier [Hz], as parameters.
 
-        A constant that follows a law has only its physical bounds. The second result is, for each original parameter,
-        the index of the constant that it determines [parameters].
+        A constant that follows a law has only its physical bounds. The second result [parameters] is the index of the
+        constant that each original parameter determines.
         """
         if not self.has_laws:
             return self, np.arange(len(self))

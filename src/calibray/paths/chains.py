@@ -4,9 +4,9 @@ The field of a path is a Jones vector. Each interaction defines a frame for the 
 frame is s = k x n / |k x n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT
 expresses the field in the basis (theta, phi) of the direction of travel. This module combines two rotations: from the
 frame of one interaction into the basis (theta, phi), and from this basis into the frame of the next interaction. All
-conventions are those of Sionna RT, so path gains agree with Sionna RT in phase as well. These conventions concern the
-reference near the poles, the orientation of normals and wedges, and the direction after a reflection, for which the
-mirrored direction is used instead of the traced direction.
+conventions are those of Sionna RT, so path gains agree with those of Sionna RT, including the phase. These conventions
+concern the reference near the poles, the orientation of normals and wedges, and the direction after a reflection, for
+which the mirrored direction is used instead of the traced direction.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ class Chains:
         source: Start of every path [P, 3], [m].
         target: End of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        normal: Normals of the surfaces at the interactions, pointing to either side [P, D, 3].
+        normal: Normals [P, D, 3] of the surfaces at the interactions; each can point to either side of the surface.
         kind: Kinds of interaction [P, D]; 0 after the last interaction.
         material: Index of the material of every interaction [P, D].
-        probability: Probability with which the tracer chose the kind of interaction [P, D].
+        probability: Probability [P, D] with which the tracer chose the kind of interaction.
         samples: Number of rays launched per source.
         edge: Directions of the diffracting edges [P, D, 3], read only at diffractions; empty without diffraction.
         normal_n: Normals of the n-faces of the wedges [P, D, 3], read only at diffractions.
-        edge_lengths: Path lengths s' from the source to an edge, and s from this edge to the next edge or to the target
-            [P, D, 2], [m], read only at diffractions.
+        edge_lengths: Path lengths [P, D, 2], [m], read only at diffractions: s' from the source to an edge, and s from
+            this edge to the next edge or to the target.
     """
 
     source: NDArray[np.float64]
@@ -192,7 +192,7 @@ def compile_chains(chains: Chains) -> Geometry:
 
 
 def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True) -> NDArray[np.float64]:
-    """Basis vector theta [..., 3] for directions of travel [..., 3], the first axis of the basis (theta, phi).
+    """Basis vector theta [..., 3], the first axis of the basis (theta, phi), for directions of travel [..., 3].
 
     Near the poles, `pole_reference` selects the fixed reference -x of Sionna RT instead of the limit of theta.
     """
@@ -238,7 +238,7 @@ def rotate(
 
 
 def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]; the azimuth is 0 near the poles."""
+    """Zenith and azimuth [..., 2], [rad], of unit vectors, in [0, pi] and (-pi, pi]; near the poles, azimuth is 0."""
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
     # The threshold is that of `spherical_basis`; without it, rounding errors would give a vertical path an arbitrary
@@ -319,7 +319,7 @@ def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 def _in_path_order(
     parts: list[tuple[NDArray[Any], ...]], empty: Diffuse | Diffraction
 ) -> list[NDArray[np.float64]]:
-    """Sort the columns of a table into the order of the interactions; the columns were collected step by step."""
+    """Sort the rows of a table into the order of the interactions; the rows were collected step by step."""
     if not parts:
         return list(vars(empty).values())
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -23,9 +23,9 @@ class Diffuse:
     """Additional constants of the diffuse reflections: one row per reflection, in the order of the interactions.
 
     Attributes:
-        rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
-            of the incident direction, in which the XPD matrix acts [D, 2].
-        solid_angle: Solid angle of the ray tube, divided by the sampling probability in the trace [D], [sr].
+        rotation: (cos, sin) [D, 2] of the rotation from the transverse electric frame into the spherical basis (theta,
+            phi) of the incident direction. The XPD matrix acts in this basis.
+        solid_angle: Solid angle [D], [sr], of the ray tube, divided by the sampling probability in the trace.
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_specular: Cosine of the angle between the scattered and specular directions [D].
         cos_backward: Cosine of the angle between the scattered direction and the direction back to the source [D].
@@ -56,8 +56,8 @@ class Diffraction:
         azimuth_out: Azimuth phi of the diffracted ray, measured from the 0-face [W], [rad].
         sin_edge: Sine of the angle beta_0 between the ray and the edge [W].
         distance: L = s s' sin^2(beta_0) / (s + s') [W], [m].
-        rotations: (cos, sin) of the four rotations between the edge-fixed frames and the transverse electric frames
-            of the faces: in 0, out 0, in n, out n [W, 4, 2].
+        rotations: (cos, sin) [W, 4, 2] of the four rotations between the edge-fixed frames and the transverse electric
+            frames of the faces: in 0, out 0, in n, out n.
     """
 
     cos_incidence_n: NDArray[np.float64]

@@ -45,7 +45,8 @@ class Paths:
         delay: Propagation delay [P], [s].
         spreading: Amplitude spreading [P], [1/m]: 1/r, or 1/sqrt(s s' (s + s')) with a diffraction.
         departure: Zenith and azimuth of departure [P, 2], [rad].
-        arrival: Zenith and azimuth of arrival, pointing from the receiver towards the source [P, 2], [rad].
+        arrival: Zenith and azimuth [P, 2], [rad], of the direction of arrival, which points from the receiver towards
+            the source.
         tx_field: Transmit pattern in the frame of the first interaction [P, T, 2], complex.
         rx_field: Receive pattern in the frame after the last interaction [P, R, 2], complex.
         first: Index of the first interaction of each path [P + 1]; path p has the interactions first[p] to first[p + 1]
@@ -59,8 +60,8 @@ class Paths:
         diffuse: Additional constants of the diffuse interactions.
         diffraction: Additional constants of the diffractions.
         settings: Settings of the trace, for documentation.
-        correction: Ratio of each path's power in the engine that found the path to its replayed power at the same
-            constants [P]. The replayed power is multiplied by this ratio. None if there is no correction.
+        correction: Ratio [P] of each path's power in the engine that found the path to its replayed power with the same
+            constants. The replayed power is multiplied by this ratio. None if there is no correction.
     """
 
     frequency: float
@@ -319,7 +320,7 @@ def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
 
 def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int64]) -> Table:
     """The rows of a table for the given interactions; `has_row` [I] marks the interactions that have a row."""
-    # The row of an interaction is the number of earlier interactions of the same kind.
+    # The row index of an interaction is the number of earlier interactions of the same kind.
     row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
     return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
 

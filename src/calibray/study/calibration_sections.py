@@ -48,14 +48,14 @@ class PriorSection(Section):
 
     Attributes:
         itu: Name of the ITU-R P.2040 material on which the prior is centred, with or without "@REVISION".
-        value: Value on which the prior is centred, in the unit of the parameter, instead of `itu`.
-        like: Name of another parameter on which the prior is centred, instead of `itu`. Both parameters are then
+        value: Value on which the prior is centred, in the unit of the parameter; an alternative to `itu`.
+        like: Name of another parameter on which the prior is centred; an alternative to `itu`. Both parameters are then
             members of the same population.
         spread: Standard deviation of the natural logarithm of the parameter; 0.3 corresponds to about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the unit of the parameter. This key
             replaces `itu`, `value`, `like` and `spread`.
-        shared: Whether `std` is the standard deviation across a population of transmitters. It is estimated if the
-            `spread` of the parameter is "auto".
+        shared: Whether `std` is the standard deviation across a population of transmitters. This standard deviation is
+            estimated if the `spread` of the parameter is "auto".
     """
 
     itu: Text | None = None
@@ -92,7 +92,7 @@ class ParameterSection(Section):
             is used.
         scale: "linear" or "log".
         prior: Prior of the parameter; uniform within the bounds if absent.
-        spread: Standard deviation between transmitters of a parameter such as "tx:*.azimuth", in the unit of the
+        spread: Standard deviation across transmitters of a parameter such as "tx:*.azimuth", in the unit of the
             parameter; "auto" estimates this standard deviation. If absent, only the value common to all transmitters is
             calibrated.
     """
@@ -107,8 +107,8 @@ class ParameterSection(Section):
         """The centre of the prior at a carrier [Hz], in the parameter's unit; 1 if the centre is another parameter.
 
         Raises:
-            InputError: The parameter has no prior, ITU-R P.2040 does not specify the constant, or the value or the
-                lower bound is not positive.
+            InputError: The parameter has no prior, ITU-R P.2040 does not specify the constant, or either the prior
+                value or the lower bound is not positive.
         """
         if self.prior is None:
             raise InputError(f"{name}: has no prior")
@@ -131,7 +131,7 @@ def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class NuisanceTerm:
-    """A column of the links multiplied by an unknown coefficient, one for all links or one per group.
+    """A column of the links, multiplied by an unknown coefficient: one for all links, or one per group.
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
@@ -180,18 +180,18 @@ TX_OFFSET: Final = "offset of the transmitter"
 """Name of the nuisance term with one offset per transmitter, used in predictions."""
 
 OF_ALL_LINKS: Final = " of all links"
-"""Suffix of the name of each nuisance term that predictions add with one coefficient for all links."""
+"""Suffix of the names of nuisance terms that predictions add, each with one coefficient for all links."""
 
 
 class NuisanceSection(Section):
-    """``[nuisance.NAME]``: a column of the links multiplied by an unknown coefficient, one for all links or per group.
+    """``[nuisance.NAME]``: a column of the links, multiplied by an unknown coefficient for all links or for each group.
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column computed from the scene ("out_of_sight",
             "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
             links.
-        per: Column of group labels. If absent, there is one coefficient for all links. With `cluster_m`, "cluster"
-            needs no column.
+        per: Column of group labels. If absent, there is one coefficient for all links. With `cluster_m`, "cluster" is
+            computed from the receiver positions and need not be a column.
         cluster_m: Side length [m] of the squares into which receivers are grouped if `per` is "cluster".
         bounds: Lower and upper bounds of the coefficient, in dB per unit of the column; unbounded if absent.
         prior: Standard deviation of a Gaussian prior around zero, in the same unit. If absent, the prior is flat. With
@@ -226,11 +226,11 @@ class NoiseSection(Section):
     """``[noise]``: the errors of the measured links.
 
     Attributes:
-        std_db: Standard deviation [dB] of the error of a link; this value determines the weight of the priors. If
-            absent, it is estimated.
+        std_db: Standard deviation [dB] of the error of a link; it determines the weight of the priors relative to the
+            measurements. If absent, it is estimated.
         kind: Distribution of the errors: "gaussian", "student-t", or "auto" for intervals that account for both.
-        range_m: Correlation distance of the errors of neighbouring links [m]; 0 for no correlation, or "auto".
-        heterogeneity: Between-building spread of the constants of a material; 0 for no spread, or "auto".
+        range_m: Correlation distance [m] of the errors of neighbouring links; 0 for no correlation, or "auto".
+        heterogeneity: Spread of a material's constants between buildings; 0 for no spread, or "auto".
         constants_spread: Standard deviation of the logarithm of a fixed constant (thickness, conductivity, scattering
             coefficient) of a calibrated material. State 0 if the values in the scene are exact. A scattering
             coefficient of 0 has a separate prior, unless `constants_spread` is 0.
@@ -266,7 +266,7 @@ MOST_BLOCKS: Final = 100
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: links that are held out to judge the result, selected in one of three ways.
+    """``[holdout]``: links that are held out to test the result, selected in one of three ways.
 
     Attributes:
         where: Row filter that selects the held-out links.
@@ -302,8 +302,8 @@ class MethodSection(Section):
 
     Attributes:
         name: "auto", "sgwo-im", "gwo" or another registered method.
-        seed: Seed of the method's random numbers.
-        model: Cheap model that approximates an expensive engine: "replay" of the study's scene, or "none".
+        seed: Seed of the method's random number generator.
+        model: Cheap approximation of an expensive engine: "replay" of the study's scene, or "none".
         options: Settings of the method `name`.
     """
 
@@ -319,7 +319,7 @@ class MethodSection(Section):
 
 
 LARGEST: Final = 10**6
-"""Maximum integer value of a setting; no method can hold more candidates in memory."""
+"""Maximum integer value of a setting, because no method can hold more candidates in memory."""
 
 LONGEST: Final = 10**4
 """Maximum number of entries in a list, and of characters in a string."""

@@ -26,7 +26,7 @@ from calibray.support.strict_models import Section, Text, dotted
 from calibray.tracing.antennas import EVERY, POSE, turns
 
 VERSION: Final = 1
-"""Version of the study file that this module reads."""
+"""Version of the study file format that this module reads."""
 
 BUNDLED: Final = "sionna:"
 """Prefix of the name of a scene bundled with Sionna RT."""
@@ -142,13 +142,13 @@ class StudyContent(Section, ABC):
             )
 
     def _laws(self) -> dict[str, bool]:
-        """Whether any parameter is a coefficient of a frequency law, with a label for messages."""
+        """Whether any parameter is a coefficient of a frequency law, keyed by a label for messages."""
         return {
             "coefficients of laws": any(split_name(name)[1].startswith("itu_") for name in self.parameters)
         }
 
     def _without_replay(self) -> dict[str, bool]:
-        """Whether the study states each setting that rules out replay of summed powers at one carrier."""
+        """Settings that rule out replay of summed powers at one carrier, and whether the study states each of them."""
         return {
             "links.frequency": self.links.frequency is not None,
             f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",

@@ -36,8 +36,9 @@ LEAST: Final = 0.01
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
 """Displacements traced on each side before the calibration, as fractions of the largest displacement. For antenna
-panels of eight rows, traced at heights 2 m apart, the error of the interpolated path loss is 0.1 dB (median) and 2 dB
-(RMS). With a parabola through the stated height and the bounds 8 m above and below, the RMS error is 5 dB."""
+panels of eight rows, traced at heights 2 m apart, the error of the interpolated path loss has a median of 0.1 dB and an
+RMS value of 2 dB. If a parabola is fitted to the path loss at the stated height and at the bounds 8 m above and below,
+the RMS error is 5 dB."""
 
 
 def displaces(name: str) -> bool:
@@ -56,9 +57,9 @@ class Displacement:
 
     Attributes:
         field: "height" of the transmitters, or "dx" or "dy" of the receivers.
-        weights: 1 if a parameter displaces a group of links, and 0 otherwise [G, parameters].
+        weights: Matrix [G, parameters]: 1 if a parameter displaces a group of links, otherwise 0.
         group: Group of every link [L].
-        reach: Largest displacement that a single parameter can cause in each group [G], [m]. The sum over parameters
+        reach: Largest displacement [G], [m], that a single parameter can cause in each group. The sum over parameters
             has the same limit.
         ground: The ground above which receivers keep their height; None if heights are not measured from the ground.
     """
@@ -80,10 +81,10 @@ class Displacement:
         return replace(links, **{end: position})
 
     def knots(self, values: NDArray[np.float64], neighbours: Sequence[float]) -> NDArray[np.float64]:
-        """Displacements at which the links are traced, in ascending order [2n + 1, L], [m].
+        """Displacements [2n + 1, L], [m], at which the links are traced, in ascending order.
 
         Args:
-            values: Values of the parameters [d] at which the displacement is 0.
+            values: Parameter values [d] at which the displacement is 0.
             neighbours: Displacements on each side, as fractions of the largest displacement. Near a bound, these
                 displacements are limited to equidistant positions up to the bound.
         """
@@ -100,7 +101,7 @@ class Displacement:
 
 
 def follow(ground: Ground | None, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
-    """Keep the height above ground of displaced positions [n, 3], [m]. Without `ground`, z is unchanged."""
+    """Keep displaced positions [n, 3], [m], at the same height above ground. Without `ground`, z is unchanged."""
     if ground is None:
         return
     with np.errstate(invalid="ignore"):  # inf - inf where there is no ground
@@ -116,8 +117,8 @@ def displacements(
 ) -> tuple[Displacement, ...]:
     """One `Displacement` for each axis along which parameters displace links.
 
-    Receivers of links without measured values have exact positions and are not displaced. `columns` names the columns
-    that contain the transmitters ("tx:") and the devices ("rx:").
+    Receivers of links without measured values have exact positions and are not displaced. `columns` states the columns
+    with the names of the transmitters ("tx:") and of the devices ("rx:").
 
     Raises:
         InputError: A column is missing.
@@ -183,7 +184,7 @@ def displacement_loss(
         neighbours: Distances to the n neighbouring positions on each side, as fractions of the largest displacement, in
             ascending order.
         links: The L links at the positions that these values determine.
-        here: The paths of these links, and the other effects on these paths.
+        here: The paths of these links, and the effects on these paths other than displacements.
         traced: Function that returns the paths of displaced links and the effects on these paths. The number of
             displaced links can differ from L.
     """
@@ -232,7 +233,7 @@ def at_index(links: Measurements, index: NDArray[np.int64]) -> Measurements:
 
 
 def reached(change_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes in path loss [K, 2n + 1, L], [dB]. Where no path arrives, the next position inwards gives the change."""
+    """Changes in path loss [K, 2n + 1, L], [dB]. Where no path arrives, use the change at the next position inwards."""
     change_db, middle = change_db.copy(), change_db.shape[1] // 2
     for step in range(1, middle + 1):
         for side in (1, -1):
@@ -256,14 +257,14 @@ def cubics(knots: NDArray[np.float64], change_db: NDArray[np.float64]) -> NDArra
 
 
 DIRECTIONS: Final = np.sqrt(2.0) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-"""Displacements in units of the standard deviation of the error. Means over these displacements equal means over a
-Gaussian error up to cubic terms (Stroud's spherical rule of degree three in the plane)."""
+"""Displacements in units of the standard deviation of the error. For polynomials up to degree three, the mean over
+these displacements equals the mean over a Gaussian error (Stroud's spherical rule in the plane)."""
 
 
 def displaced(
     links: Measurements, error_m: NDArray[np.float64], ground: Ground | None = None
 ) -> Measurements:
-    """Links to displaced receivers, ordered by direction; `error_m` is the standard deviation of positions [L], [m].
+    """Links to displaced receivers, ordered by direction; `error_m` [L], [m], is the standard deviation of positions.
 
     With a `ground`, receivers keep their height above the ground.
     """
@@ -276,7 +277,7 @@ def displaced(
 
 
 def averaged(paths: Paths, links: Measurements) -> Paths:
-    """Assign the paths of displaced receivers to the original links; the power of a link is the mean over receivers.
+    """Assign the paths of displaced receivers to the original links; a link has the mean power of its receivers.
 
     Displaced receivers without a path are excluded from the mean.
     """
@@ -298,7 +299,7 @@ def mounted_at_displaced(mountings: Mapping[str, Mounting], count: int) -> dict[
 
 
 def spread_db(path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of path loss over the displacements of each link [L], [dB].
+    """Standard deviation [L], [dB], of the path loss of each link over its displaced receivers.
 
     The result is 0 if only one displaced receiver has a path.
     """

@@ -43,24 +43,24 @@ from calibray.tracing.settings import PATTERNS, Antenna
 _LOG: Final = logging.getLogger(__name__)
 
 AVERAGING_WAVELENGTHS: Final = 40
-"""Width of the cells over which fading is averaged [wavelengths] (Lee 1985; see `calibray.measurements.reading`)."""
+"""Width [wavelengths] of the cells over which fading is averaged (Lee 1985; see `calibray.measurements.reading`)."""
 
 PLACE_SAMPLES: Final = 20
-"""Minimum median number of samples per position for averaging by position, as in a stationary scan.
-The logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
+"""Samples are averaged by position, as in a stationary scan, if their median number per position is at least this
+large. The logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 CLIPPED_SHARE: Final = 0.03
-"""Minimum share of values equal to the lowest value at which clipping by the receiver is assumed."""
+"""Clipping by the receiver is assumed only if at least this share of the values equals the lowest value."""
 
 CLIPPED_RATIO: Final = 10
-"""Minimum ratio of the count of the lowest value to the median count of other values at which clipping is assumed."""
+"""Clipping is assumed only if the lowest value occurs at least this many times as often as other values (median)."""
 
 MISSING_SHARE: Final = 0.1
-"""Fraction of missing powers of a device above which the lowest power of this device is used as its noise floor."""
+"""If more than this fraction of a device's powers is missing, its lowest power is used as its noise floor."""
 
 FEWEST_OF_DEVICE: Final = 20
-"""Minimum number of measured powers from which the noise floor of a device is inferred. The lowest of 20 powers is in
-the lowest tenth of the distribution in 88 % of cases."""
+"""Minimum number of measured powers that are needed to infer the noise floor of a device. With a probability of 88 %,
+the lowest of 20 powers is in the lowest tenth of the distribution."""
 
 
 def draft_links(scene: str, links: Path, target: Path, given: Given) -> LinksDraft:
@@ -194,7 +194,7 @@ def _leave_out_saturated(draft: LinksDraft, value: ValueColumn, column: pd.Serie
 
 
 def _share_at_lowest(values: pd.Series) -> float:
-    """Share of values equal to the lowest value, if a receiver seems to report it for all lower powers; otherwise 0."""
+    """Share of values equal to the lowest value if a receiver seems to report it for lower powers, otherwise 0."""
     counts = values.value_counts().sort_index()
     share = counts.iloc[0] / counts.sum()
     if share >= CLIPPED_SHARE and counts.iloc[0] >= CLIPPED_RATIO * counts.iloc[1:].median():
@@ -203,7 +203,7 @@ def _share_at_lowest(values: pd.Series) -> float:
 
 
 def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
-    """Average samples by position in stationary scans and height profiles, and in cells if other samples are dense."""
+    """Average samples by position in stationary scans and height profiles; average other dense samples in cells."""
     frame, name = draft.table.frame, draft.section.get("transmitter")
     heights = [] if rx.height is None else [rx.height]
     keys = [rx.x, rx.y, *heights, *draft.groups, *([name] if name and name not in draft.groups else [])]
@@ -261,7 +261,7 @@ def _add_observables(draft: LinksDraft) -> None:
 
 
 MOST_MATERIALS: Final = 6
-"""Maximum number of materials that a draft calibrates; links seldom determine more materials."""
+"""Maximum number of materials that a draft calibrates, because links seldom determine more materials."""
 
 INDOOR_DEPTHS: Final = (3, 5)
 """Minimum and maximum number of interactions along a path in an indoor study."""
@@ -355,7 +355,7 @@ def _indoors(links: LinksDraft) -> bool:
 
 
 def _depth(links: LinksDraft) -> int:
-    """Maximum number of interactions: walls on a straight line (95 % quantile) plus two, within `INDOOR_DEPTHS`."""
+    """Maximum number of interactions: walls crossed in a straight line (95 % quantile) plus 2, in `INDOOR_DEPTHS`."""
     measured = links.measurements()
     walls = int(np.quantile(count_crossings(links.overhead.walls, measured.tx, measured.rx), 0.95))
     lowest, highest = INDOOR_DEPTHS
@@ -368,7 +368,7 @@ def _depth(links: LinksDraft) -> int:
 def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
     """The scene, and the constants of materials for which ITU-R P.2040 has no law at the carrier.
 
-    These constants are those of the material at the nearest frequency that its law covers.
+    The constants are those at the nearest frequency that the law of the material covers.
     """
     try:
         return read_scene(links.scene, links.frequency), {}
@@ -391,7 +391,7 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
 
 
 def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The region of trees from the file next to the scene, and its parameter if a straight line crosses the region."""
+    """The region of trees from the file next to the scene, and its parameter if a link's straight line crosses it."""
     file = Path(links.scene).parent / TREES_FILE
     # For other scenes, a file of this name need not contain the columns that `calibray scene` writes.
     if links.scene.startswith(BUNDLED) or read_frame(links.scene) is None or not exists(file):
@@ -412,7 +412,7 @@ def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
-    """The entries of ``[parameters]``: permittivities and, indoors, conductivities, which determine wall losses."""
+    """The entries of ``[parameters]``: permittivities and, indoors, conductivities (these determine wall losses)."""
     bounds_of = permittivity_bounds(scene.materials)
     names, rest = list(bounds_of)[:MOST_MATERIALS], list(bounds_of)[MOST_MATERIALS:]
     if not names:
@@ -511,9 +511,10 @@ def add_antennas(links: LinksDraft) -> dict[str, Any]:
 def _patterns(
     links: LinksDraft, folder: Path, mount: dict[str, str]
 ) -> tuple[dict[str, Any], NDArray[np.bool_], list[Path]]:
-    """The antennas named in a column of the transmitters, the rows with omnidirectional antennas, and the files.
+    """The antennas named in a column of the transmitters, a mask of rows with omnidirectional antennas, and the files.
 
-    Each name is that of a file in the folder or of a Sionna RT pattern. A single file is used for all transmitters.
+    Each name is that of a file in the folder or of a Sionna RT pattern. Without such a column, a single file is used
+    for all transmitters.
 
     Raises:
         InputError: The folder cannot be used, or an antenna is not named or has no file.
@@ -560,13 +561,13 @@ def _patterns(
 
 
 def _cells(links: LinksDraft, column: str, rows: NDArray[np.bool_]) -> str:
-    """The file, column and rows of table cells of the transmitters, formatted for messages."""
+    """Location (file, column and rows) of cells in the table of transmitters, formatted for messages."""
     table = links.transmitter_table
     return f"{table.source}: column {column!r} in {rows_text(table.row[rows].tolist())}"
 
 
 def _antenna(links: LinksDraft, pattern: Path | str) -> dict[str, str]:
-    """An antenna with a Sionna RT pattern or the pattern in a file. The file must be readable."""
+    """An antenna with a Sionna RT pattern or with the pattern in a file. The file must be readable."""
     if isinstance(pattern, Path):
         read_gain_table(pattern)
         pattern = links.relative(pattern)
@@ -574,7 +575,7 @@ def _antenna(links: LinksDraft, pattern: Path | str) -> dict[str, str]:
 
 
 def schema_text() -> str:
-    """The schema as JSON text that ends with a line break."""
+    """The schema as JSON text ending with a line break."""
     return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
 
 

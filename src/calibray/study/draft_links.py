@@ -41,14 +41,14 @@ from calibray.support.messages import counted, shortened
 _LOG: Final = logging.getLogger(__name__)
 
 RECEIVER_HEIGHT: Final = 1.5
-"""Default height [m] of a receiver if there is no column of heights; the value applies to a handheld phone."""
+"""Default height [m] of a receiver if there is no column of heights; typical of a handheld phone."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn", "msnm"})
 """Words in the names of altitude columns. Their meaning varies: satellite receivers report altitudes above sea level,
 and drones also report altitudes above ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
-"""Default height [m] of a transmitter if there is no column of heights; the value applies to a small cell on a mast."""
+"""Default height [m] of a transmitter if there is no column of heights; typical of a small cell on a mast."""
 
 SAME_CARRIER: Final = 0.01
 """Maximum relative difference between frequencies that count as one carrier. This difference changes free-space loss by
@@ -80,7 +80,7 @@ class Given:
         antennas: Folder of MSI files, each named after an antenna of the transmitters.
         tx: Transmitter position (x, y, z) [m] in the scene frame, unless a table contains it.
         frequency: Carrier frequency [Hz], unless a table contains it.
-        origin: Longitude and latitude of the scene's origin [deg], unless the scene file contains them.
+        origin: Longitude and latitude [deg] of the scene's origin, unless the scene file contains them.
     """
 
     transmitters: Path | None = None
@@ -104,7 +104,7 @@ class LinksDraft:
         assumptions: The assumptions.
         frequency: The study's carrier [Hz].
         table: The table of links, without the rows that have been left out.
-        sites: The table of transmitters, limited to those in the links; None if there is no such table.
+        sites: The table of transmitters, limited to the transmitters of the links; None if there is no such table.
         rx: Columns of the receivers' positions.
         tx: Columns of the transmitters' positions; None if there are no such columns.
         groups: The columns whose labels define the groups of the offset.
@@ -151,7 +151,7 @@ class LinksDraft:
 
     @property
     def transmitter_table(self) -> SourceTable:
-        """The table of transmitters, with columns renamed as in the links; the table of links if there is none."""
+        """The table of transmitters, with columns renamed as in the links; without such a table, the table of links."""
         if self.sites is None:
             return self.table
         return replace(self.sites, frame=self.sites.frame.rename(columns=self._name_in_links))
@@ -171,7 +171,7 @@ class LinksDraft:
             self.assumptions[self.assumptions.index(earlier)] = merged
 
     def measurements(self) -> Measurements:
-        """The links, as read with the keys already drafted."""
+        """The links, read with the keys drafted so far."""
         content = {
             "version": VERSION,
             "scene": self.scene_section | {"frequency": 1e9},
@@ -288,7 +288,7 @@ class LinksDraft:
         self._leave_out(lacking, "no receiver position")
 
     def _leave_out(self, rows: NDArray[np.bool_], cause: str) -> None:
-        """Remove the rows that the drafted filter excludes, and record their number."""
+        """Remove the rows that the drafted filter excludes, and record how many there are."""
         number = int(rows.sum())
         reason = f"{cause}: {counted(number, 'row')} {'is' if number == 1 else 'are'} left out"
         self.assume("links.where", self.section["where"], reason)
@@ -415,7 +415,7 @@ class LinksDraft:
         return replace(rx, position="geographic"), tx and replace(tx, position="geographic")
 
     def _name_in_links(self, column: str | None) -> str | None:
-        """Name of a transmitter column in the links. It is changed if the links already have a column of this name."""
+        """Name of a transmitter column in the links, changed if the links already have a column with this name."""
         taken = column in self.table.frame and column != self._transmitter_key
         return f"{self._transmitter_key}_{column}" if taken else column
 

@@ -30,18 +30,19 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 0.5
-"""Maximum distance [m] between a wall and its polygon; walls are on the outlines of buildings."""
+"""Maximum distance [m] of a wall from its polygon, because walls are on the outlines of buildings."""
 
 BESIDE: Final = 0.1
-"""Distance [m] from a wall at which its two sides are distinguished; points at smaller distances are on the wall."""
+"""Maximum distance [m] in plan between a wall and a point on this wall. A roof at this distance from the wall indicates
+which side is the inside."""
 
 
 class FacadeSection(Section):
     """``[facades.NAME]``: a separate material for those parts of walls that meet all the stated criteria.
 
     Attributes:
-        of: Material of the scene whose surfaces are divided. The new material has the same constants, unless
-            ``[materials]`` states its own constants.
+        of: Material of the scene that the new material replaces on these parts of walls. The new material has the same
+            constants, unless ``[materials]`` states other constants for it.
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
         facing: Compass bearings [deg] that limit the direction of the outward normal of the wall, clockwise from the
@@ -53,9 +54,9 @@ class FacadeSection(Section):
         column: Column of the file. Only polygons with the value NAME in this column are used; without `column`, all
             polygons are used.
         position: "geographic" or "scene", as in ``[regions]``.
-        share: Fraction of the wall that strips of this material, such as windows, cover.
-        module: Distance [m] between the centres of neighbouring strips; it is rounded so that a wall has a whole number
-            of strips.
+        share: Fraction of the wall covered by strips of this material, such as windows.
+        module: Distance [m] between the centres of neighbouring strips; the distance is rounded so that a wall has a
+            whole number of strips.
     """
 
     of: Text
@@ -163,7 +164,7 @@ def _applies(
     surfaces: SceneSurfaces,
     point: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Whether all rules of a facade apply, for each point [n] of its material."""
+    """Whether all rules of a facade apply to each point [n] of its material."""
     shapely = library("shapely", "scenes")
     applies = np.ones(len(point), dtype=bool)
     if section.storeys is not None:
@@ -236,7 +237,7 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
 
 
 def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths: Paths) -> Effects:
-    """The loss of specular reflections on rough surfaces; empty if no material is rough.
+    """The loss of specular reflections at rough surfaces; empty if no material is rough.
 
     `stated` contains the standard deviation [mm] of the surface height, by material name.
     """

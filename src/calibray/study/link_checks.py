@@ -30,7 +30,8 @@ from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
 BELOW_FREE_SPACE_DB: Final = 6.0
-"""Largest plausible amount [dB] by which path loss is below free-space loss; a ground reflection adds up to 6 dB."""
+"""Largest plausible amount [dB] by which path loss can be below free-space loss; a ground reflection adds up to 6
+dB."""
 
 GUIDED_DB: Final = 12.0
 """Largest such amount [dB] under a roof. In a corridor of 40 m by 2.4 m, four reflections can add 11 dB at 60 GHz."""
@@ -42,25 +43,26 @@ CELL_SHARE: Final = 0.05
 """Maximum width of averaging areas, as a fraction of the shorter side of the scene."""
 
 HIGH: Final = 300.0
-"""Height limit above the top of the scene [m]. Greater heights are probably altitudes above sea level that were read as
+"""Height limit [m] above the top of the scene. Greater heights are probably altitudes above sea level that were read as
 heights above ground. Drones fly up to 120 m above ground (Regulation (EU) 2019/947), and few masts are higher than 300
 m."""
 
 DOMINATED: Final = 0.5
-"""Effective fraction of the positions below which a few positions with many rows dominate the fit. In district 383,
-three of about 47 positions had 60 rows each (an effective fraction of 10 %). Prediction errors were 3.5 dB instead of
-3.0 dB, and 90 % intervals covered 86 % of the links instead of 93 %. With ten rows at every position (100 %), neither
-the errors nor the coverage changed."""
+"""If the effective fraction of the positions is lower, a few positions with many rows dominate the fit. In district
+383, three of about 47 positions had 60 rows each (an effective fraction of 10 %). Prediction errors were 3.5 dB instead
+of 3.0 dB, and 90 % intervals covered 86 % of the links instead of 93 %. With ten rows at every position (an effective
+fraction of 100 %), neither the errors nor the coverage changed."""
 
 SPREAD: Final = 5.0
-"""Width [m] of the cells in which GPS positions, such as those of a parked car, count as one. GPS positions of phones
-are accurate to 4.9 m under an open sky (GPS.gov, GPS accuracy)."""
+"""Width [m] of the cells in which GPS positions, such as those of a parked car, count as one position. GPS positions of
+phones are accurate to 4.9 m under an open sky (GPS.gov, GPS accuracy)."""
 
 LOSSY: Final = 0.5
-"""Mean gain [1] below which a gain table with a maximum of exactly 0 dBi probably contains relative gains."""
+"""Mean gain [1] below which a gain table with a maximum of exactly 0 dBi probably contains gains relative to the
+maximum."""
 
 LINKS_PER_UNKNOWN: Final = 5
-"""Minimum number of links per unknown that is sufficient to constrain the unknowns of a fit."""
+"""Minimum number of links per unknown needed to constrain the unknowns of a fit."""
 
 _Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _TURNS: Final[dict[str, _Turn]] = {
@@ -140,7 +142,7 @@ def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...
 
 
 def _count_coefficients(study: StudyModel, section: NuisanceSection, links: Measurements) -> int:
-    """Number of coefficients of a nuisance term, which is the number of groups.
+    """Number of coefficients of a nuisance term: one per group.
 
     A random effect counts as one coefficient, because only its mean is free.
     """
@@ -178,7 +180,8 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
     cell = SPREAD if is_geographic else 0.01
     ends = np.round(np.hstack([links.tx, links.rx]) / cell)
     count = np.unique(ends, axis=0, return_counts=True)[1]
-    # `effective` is the number of positions if all have equally many rows; it is nearly 1 if one has nearly all rows.
+    # `effective` is the number of positions if all have equally many rows; it is nearly 1 if one position has nearly
+    # all rows.
     effective = len(links) ** 2 / float(np.sum(count.astype(float) ** 2))
     if effective < DOMINATED * len(count):
         within = f" within {cell:g} m" if is_geographic else ""
@@ -193,7 +196,7 @@ def _dominant_positions(links: Measurements, is_geographic: bool) -> Iterator[tu
 def _transmitters(
     study: StudyModel, links: Measurements
 ) -> tuple[NDArray[np.float64], Callable[[NDArray[np.bool_]], str]]:
-    """Positions of the transmitters [n, 3], [m], and a function that counts and names the transmitters in a mask [n].
+    """Positions [n, 3], [m], of the transmitters, and a function that counts and names the transmitters in a mask [n].
 
     Transmitters with different names, such as the sectors of a mast, count separately even at the same position.
     """
@@ -322,7 +325,7 @@ def refuse_far_receivers(
         is_geographic: Whether the positions in the table are in degrees.
 
     Raises:
-        InputError: All receivers are farther from the scene.
+        InputError: All receivers are too far from the scene.
     """
     furthest, far = _far(bounds, rx)
     if far.all():
@@ -344,7 +347,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """The axis changes that misplace the fewest receivers, and that number; None if it exceeds a quarter of `wrong`."""
+    """Axis changes that misplace the fewest receivers, and this number; None if it exceeds a quarter of `wrong`."""
     if len(rx) < FEW or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}
@@ -414,7 +417,7 @@ def _delays(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
     """Check whether most measured delays belong to paths that are much longer than the scene."""
     longest = FAR * max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
     for name, section in study.observables.items():
-        # Devices add unknown delays to times of flight, which a bias accounts for.
+        # Devices add unknown delays to times of flight; a bias accounts for these delays.
         if KINDS[section.kind] != "s" or section.column is None or section.bias is not None:
             continue
         measured = links.table.numbers(section.column, gaps=True) * section.scale
@@ -471,7 +474,7 @@ def _antennas(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str
 
 
 def _horizontal_gain(antenna: Antenna) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    """Gain at the horizon [dB] as a function of azimuth from the main direction; None if the gain is constant."""
+    """Gain [dB] in the horizontal plane, by azimuth relative to the main direction; None if the gain is constant."""
     if antenna.pattern == "tr38901":
         # 3GPP TR 38.901, Table 7.3-1.
         return lambda azimuth: -np.minimum(12 * (np.degrees(azimuth) / 65) ** 2, 30.0)
@@ -488,7 +491,7 @@ def _spread(
     other: NDArray[np.float64],
     yaw: float,
 ) -> float:
-    """Standard deviation [dB] of path loss around a log-distance line, without the antenna gain."""
+    """Standard deviation [dB] of path loss around a log-distance line, after removal of the antenna gain."""
     away = other - own
     azimuth = (np.arctan2(away[:, 1], away[:, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi
     # Measured path loss includes the antenna gain; adding this gain removes the dependence on azimuth.

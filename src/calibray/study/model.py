@@ -218,7 +218,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def roughness_mm(self) -> dict[str, float]:
-        """Standard deviations of the surface height [mm] stated in ``[materials]``, by material name."""
+        """Standard deviations [mm] of the surface height, stated in ``[materials]``, by material name."""
         stated = {name: material.roughness_mm for name, material in self.materials.items()}
         return {name: height for name, height in stated.items() if height is not None}
 
@@ -275,7 +275,7 @@ class StudyModel(StudyContent, ABC):
     ) -> Parameters:
         """The parameters, in the order of the file, with their start values for a scene with materials `base`.
 
-        Materials without a frequency law in `laws` are independent of frequency.
+        The constants of materials without a frequency law in `laws` do not depend on frequency.
 
         Raises:
             InputError: The scene lacks the material of a parameter, or a start value is outside the bounds.
@@ -320,7 +320,7 @@ class StudyModel(StudyContent, ABC):
     def content(self) -> dict[str, Any]:
         """The study as a dictionary with all defaults, which `Study.from_content` can read."""
         content = self.model_dump(mode="json", exclude_none=True)
-        # These keys belong to other engines, and `replace` may select one of these engines.
+        # Keep the keys of other engines, because `replace` may select one of these engines.
         content["engine"] |= self._other_engines
         return content
 
@@ -355,7 +355,7 @@ class StudyModel(StudyContent, ABC):
                 )
 
     def _named_files(self) -> list[tuple[str, str, Path]]:
-        """Key, stated name and path of the files that the study names."""
+        """Key, stated name and path of each file that the study names."""
         links = self.links
         files: list[tuple[str, str | None, Path | None]] = [
             ("links.file", links.file, self.links_path),

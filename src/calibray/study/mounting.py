@@ -28,8 +28,8 @@ PORT_POWER: Final = "tx_port_power_dbm"
 """Name of the column with the power [dBm] that the transmitter of a link feeds into its antenna."""
 
 LEAST_GAIN: Final = 1e-3
-"""Minimum gain [1] along the straight line. In nulls, paths in other directions carry the power. The patterns of 3GPP
-TR 38.901 are limited to 30 dB below the maximum gain."""
+"""Minimum gain [1] along the straight line. If this line is in a null, paths in other directions carry the power. The
+patterns of 3GPP TR 38.901 have a lower limit of 30 dB below the maximum gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
@@ -88,7 +88,8 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
         yaw = np.arctan2(away[:, 1], away[:, 0])
         # Downtilt is positive downwards.
         downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
-    # A bearing is clockwise from north, yaw counter-clockwise from east. Steering has the same sense as azimuth.
+    # A bearing is measured clockwise from north, and yaw is measured counter-clockwise from east. Steering is measured
+    # in the same sense as azimuth.
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     if section.azimuth_from == "north":
@@ -103,10 +104,9 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
 
 
 def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
-    """Sum of the stated antenna gains of both ends along the straight line of each link [L], [dBi].
+    """Sum [L], [dBi], of the stated antenna gains at both ends along the straight line of each link.
 
-    The gain at an end is 0 dBi if all links have the same single antenna with a Sionna RT pattern without main
-    direction.
+    The gain at an end is 0 dBi if all links share one antenna there, and its Sionna RT pattern has no main direction.
 
     Raises:
         InputError: A column is missing or malformed, or names an unknown antenna.
@@ -136,7 +136,8 @@ def pose_effects(
 ) -> Effects:
     """The effects of antenna pose errors on paths; empty if no parameter, such as "tx:CELL.azimuth", turns an antenna.
 
-    `mountings` and `table` describe all links. `paths` contains the paths of selected links, and the link indices.
+    `mountings` and `table` describe all links. `paths` contains the paths of selected links and the indices of these
+    links.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -157,7 +158,7 @@ def pose_effects(
 
 
 def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Parameter]) -> NDArray[np.str_]:
-    """Name of the transmitter of every row [rows]; empty strings if all parameters apply to every transmitter.
+    """Transmitter name of every row [rows]; empty strings if all parameters apply to every transmitter.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -210,7 +211,7 @@ def states_port_power(study: StudyModel) -> bool:
 
 
 def port_power(study: StudyModel, table: SourceTable, optional: bool = False) -> NDArray[np.float64] | None:
-    """Power that the transmitter of each row feeds into the antenna [rows], [dBm].
+    """Power [rows], [dBm], that the transmitter of each row feeds into its antenna.
 
     This power is the transmitted power minus the cable loss, or the EIRP minus the maximum gain of the antenna. With
     `optional`, the result is None if a column is missing.
@@ -263,10 +264,10 @@ def estimated_fields(study: StudyModel) -> tuple[str, ...]:
 
 
 def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
-    """The content of a study with one further parameter per transmitter for each parameter that has a `spread`.
+    """The content of a study in which each parameter with a `spread` has one further parameter per transmitter.
 
-    Another parameter represents transmitters without measured links. Its prior is that of the population, and no link
-    constrains this parameter.
+    One more parameter represents transmitters without measured links. This parameter has the prior of the population,
+    and no link constrains it.
 
     Raises:
         InputError: The column of transmitters is missing.
@@ -286,7 +287,7 @@ def with_population(study: StudyModel, links: Measurements) -> dict[str, Any]:
 
 
 def with_spreads(study: StudyModel, spreads: Mapping[str, float]) -> dict[str, Any]:
-    """The content of a study with new standard deviations of the transmitters' priors, given by field."""
+    """The content of a study with new standard deviations of the transmitters' priors, keyed by field name."""
     content = study.content()
     for name, entry in content["parameters"].items():
         field = name.rpartition(".")[2]

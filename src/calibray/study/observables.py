@@ -31,18 +31,18 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class ObservableSection(Section):
-    """``[observables.NAME]``: a statistic of the paths of each link that was measured in addition to path loss.
+    """``[observables.NAME]``: a statistic of each link's paths, measured in addition to path loss.
 
     Attributes:
         kind: The measured quantity.
         column: Column of the measured values. Links without a value do not have this observable.
-        columns: Columns of the bins of a profile, instead of `column`.
-        file: File of measured multipath components or impulse responses from which the values are computed, instead of
-            columns.
+        columns: Columns of a profile, one per bin; an alternative to `column`.
+        file: File of measured multipath components or impulse responses from which the values are computed; an
+            alternative to columns.
         id: Column of link labels, in the table of links and in a multipath table.
         where: Row filter that selects the links with this observable. If absent, all links have the observable.
-        compass: Whether azimuths in the file are compass bearings, clockwise from north.
-        sample_rate: Sample rate of impulse responses without delays [Hz].
+        compass: Whether azimuths in the file are compass bearings, measured clockwise from north.
+        sample_rate: Sample rate [Hz] of impulse responses that are stored without delays.
         margin_db: Margin [dB] by which a sample of an impulse response must exceed the noise to be used.
         unit: Unit of the values: "s", "ms", "us", "ns", "ps" or "m" for times ("m" is the distance travelled at the
             speed of light), "dB" for levels, "rad" or "deg" for angles.
@@ -50,13 +50,13 @@ class ObservableSection(Section):
         bias: "all" for one unknown bias of all values, or a column of labels for one bias per label. If absent, there
             is no bias.
         path: Path that determines a time of flight: "mean" (the mean over all paths), "first" or "strongest".
-        dynamic_range_db: Power range [dB] below the strongest path in which the receiver detects paths. If absent, the
-            receiver detects all paths.
-        floor_db: Path gain below which the receiver detects no paths [dB]; no limit if absent.
-        window: Longest delay after the first path [s]; no limit if absent.
+        dynamic_range_db: Power range [dB] below the strongest path within which the receiver detects paths. If absent,
+            the receiver detects all paths.
+        floor_db: Path gain [dB] below which the receiver detects no paths; no limit if absent.
+        window: Longest delay [s] after the first path; no limit if absent.
         bandwidth: Bandwidth of the receiver [Hz]. If absent, the receiver resolves all paths.
-        edges: Edges of the bins of a power delay profile, as delays after the first path [s]. N bins have N + 1 edges.
-        edges_deg: Edges of angular sectors, as azimuths counter-clockwise from the x axis [deg].
+        edges: Bin edges of a power delay profile, as delays [s] after the first path. N bins have N + 1 edges.
+        edges_deg: Edges of angular sectors, as azimuths [deg] measured counter-clockwise from the x axis.
     """
 
     kind: Literal[

@@ -65,10 +65,10 @@ class RegionSection(Section):
         bottom: Height of the bottom of the region: a number [m], or a column of the file (in metres, or in the unit
             stated in the column name).
         top: Height of the top of the region, in the same form; not allowed with a canopy.
-        specific_attenuation: Loss per unit length of a short path inside the region, at the study's carrier [dB/m]; the
+        specific_attenuation: Loss per unit length [dB/m] of a short path inside the region, at the study's carrier; the
             start value if the specific attenuation is a parameter.
         frequency_exponent: Frequency exponent [1] that scales the specific attenuation to other carriers.
-        maximum_db: Loss of a very long path inside the region [dB]. If absent, the ITU-R P.833 value for woodland is
+        maximum_db: Loss [dB] of a very long path inside the region. If absent, the ITU-R P.833 value for woodland is
             used.
     """
 
@@ -215,7 +215,7 @@ def _known(frame: Frame | None, path: Path) -> Frame:
 
 @dataclass(frozen=True)
 class Place:
-    """The georeference of a scene, if known, and a function that reads the surfaces, for regions and facades."""
+    """The georeference of a scene, if known, and a function that reads its surfaces, for regions and facades."""
 
     frame: Frame | None
     surfaces: Callable[[], SceneSurfaces]
@@ -281,11 +281,11 @@ def region_effects(
 def _segments(
     paths: Paths, displaced: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """The straight segments of all paths: index of the path [k] and both end points [k, 3], [m]."""
+    """The straight segments of all paths: path index [k], and both end points [k, 3], [m]."""
     number = np.arange(paths.num_paths)
     path = np.repeat(number, np.diff(paths.first) + 1)
-    # A path with n interactions has n + 1 segments, so the first segment of path p is p places after its first
-    # interaction.
+    # A path with n interactions has n + 1 segments, so the index of the first segment of path p exceeds the index of
+    # its first interaction by p.
     begins, ends = paths.first[:-1] + number, paths.first[1:] + number
     start = np.empty((len(path), 3))
     end = np.empty((len(path), 3))
@@ -296,7 +296,7 @@ def _segments(
     inner[begins], inner[ends] = True, False
     end[inner] = paths.vertex
     if displaced:
-        # The last segment follows from its direction and the remaining length of the path.
+        # The last segment is computed from its direction and the remaining length of the path.
         before = np.bincount(path[inner], np.linalg.norm(end - start, axis=1)[inner], paths.num_paths)
         last = paths.delay * speed_of_light - before
         # The arrival direction points from the receiver back along the ray.

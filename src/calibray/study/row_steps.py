@@ -71,7 +71,7 @@ def link_columns(study: StudyModel) -> LinkColumns:
 
 
 def row_steps(study: StudyModel) -> Preparation:
-    """The steps, as stated in a study, that convert rows to links.
+    """The steps, stated in a study, that convert rows to links.
 
     Raises:
         InputError: The scene is not georeferenced or cannot be read.
@@ -85,13 +85,13 @@ def row_steps(study: StudyModel) -> Preparation:
     # Columns computed from the scene are added to the links later.
     keep = [label for label in groups if label not in (*OBSTRUCTION, CLUSTER)]
     keep += [links.frequency] if links.frequency else []
-    # The means of links must not include values that a filter excludes.
+    # The mean over the rows of a link must not include values that a filter excludes.
     filtered: dict[str, Compute] = {
         FILTERED.format(column=item.column, name=name): partial(filtered_values, item)
         for name, item in study.observables.items()
         if item.column is not None and item.where is not None
     }
-    # A mean of equal labels or positions could differ from them in the last digit.
+    # The mean of equal labels or positions could differ from the common value in the last digit.
     others = {*keep, *links.tx, *links.rx, *POSITION_COLUMNS, links.value, "constant", "log_distance"}
     means = {*(term.by for term in study.nuisance_terms.values()), links.position_error_m}
     return replace(
@@ -121,7 +121,7 @@ def row_steps(study: StudyModel) -> Preparation:
 
 
 def _held_out_parts(holdout: HoldoutSection, value: str, table: SourceTable) -> NDArray[Any]:
-    """Labels [rows] of those parts of a table that are held out separately.
+    """Labels [rows] that assign each row to a separately held-out part of a table.
 
     All labels are 0 if the parts depend on the measured value or on columns that averaging adds. Such parts are
     determined later from the averaged and merged links.

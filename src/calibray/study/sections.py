@@ -64,7 +64,7 @@ class MaterialSection(Section):
         alpha_r: Exponent [1] of the lobe around the specular direction.
         alpha_i: Exponent [1] of the backscattering lobe towards the source.
         lambda_: Fraction [1] of the diffuse power in the lobe around the specular direction.
-        roughness_mm: Standard deviation of the surface height [mm]. Roughness attenuates specular reflections.
+        roughness_mm: Standard deviation [mm] of the surface height. Roughness attenuates specular reflections.
     """
 
     itu: Text | None = None
@@ -99,7 +99,7 @@ class AverageSection(Section):
             intervals of the travelled distance (in row order), and "time" in time windows.
         size: Width of a cell or length of an interval [m], or duration of a window [s]; required except for "place".
         time: Column of times; allowed only with "time".
-        unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
+        unbiased: Whether to correct for the biased logarithm of a mean over few samples.
         minimum_count: Minimum number of samples in an average; averages over fewer samples are excluded.
     """
 
@@ -156,9 +156,10 @@ class MountingSection(Section):
 
     Attributes:
         type: Column with names from ``[antennas.types]``. If absent, all links have the antenna of ``[antennas]``.
-        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. This rotation is added to the orientation
-            stated in ``[antennas]``.
-        azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
+        azimuth_deg: Azimuth [deg], a number or a column; if absent, the direction of x. This rotation is added to the
+            orientation stated in ``[antennas]``.
+        azimuth_from: "north" for compass bearings (measured clockwise from y), "east" for angles measured
+            counter-clockwise from x.
         downtilt_deg: Mechanical downtilt [deg], a number or a column.
         electrical_downtilt_deg: Downward tilt [deg] of the pattern or, for an array, of the beam, in the frame of the
             antenna; a number or a column.
@@ -185,7 +186,7 @@ class MountingSection(Section):
 
     @property
     def columns(self) -> dict[str, str]:
-        """The columns of the table of links named in this section, by key."""
+        """The columns of the table of links that this section names, by key."""
         keys = ("type", "azimuth_deg", "downtilt_deg", "electrical_downtilt_deg", "steering_deg")
         return {key: getattr(self, key) for key in keys if isinstance(getattr(self, key), str)}
 
@@ -216,7 +217,7 @@ class LinksSection(Section):
         rx_antenna: Antennas of the receivers, if these differ between links.
         device: Column with the names of receiving devices, for parameters such as "rx:PHONE.dx" that displace these
             devices.
-        position_error_m: Standard deviation of receiver position errors along x and y [m], a number or a column.
+        position_error_m: Standard deviation [m] of receiver position errors along x and y, a number or a column.
         frequency: Column of carrier frequencies, in Hz or in the unit that its name states. If absent, all links have
             the carrier of ``[scene]``.
         wide: Names of the transmitters by column, for a table with one column per transmitter.
@@ -315,7 +316,7 @@ class AntennasSection(Section):
         rx: The receive antenna.
         types: Further antennas by name, for ``links.tx_antenna.type`` and ``links.rx_antenna.type``.
         known: Whether an engine that exports rays used these antennas. By default, isotropic vertical antennas at both
-            ends, which a draft assumes, count as unknown.
+            ends count as unknown, because a draft assumes such antennas.
     """
 
     tx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]

@@ -78,7 +78,8 @@ class Setup:
         factory: Function that opens the scene in a ray tracer.
         placed: Values of the parameters at which paths are traced, if parameters displace antennas; by default, the
             start values.
-        neighbours: Distances to the neighbouring positions that are traced, as fractions of the largest displacement.
+        neighbours: Distances to the neighbouring positions at which paths are traced, as fractions of the largest
+            displacement.
     """
 
     study: StudyModel
@@ -163,7 +164,7 @@ class Setup:
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on paths that material constants do not cause, such as antenna errors and losses in regions.
+        """Effects on paths other than those of material constants, such as antenna errors and losses in regions.
 
         `links` contains the indices of the links to which the paths belong; if None, the paths belong to all links.
         """
@@ -335,7 +336,7 @@ class Setup:
         """The paths of the links: traced, read from the cache, or obtained from a ray table or an external program.
 
         A program that returns rays is called once. Links that differ only in carrier are traced once. `materials`
-        override, by name, the materials of the scene. `progress` is called with "tracing" after every launch.
+        replace the materials of the scene with the same names. `progress` is called with "tracing" after every launch.
 
         Raises:
             InputError: The tracer cannot be used, or the scene lacks a material.
@@ -375,7 +376,7 @@ class Setup:
 
     @cached_property
     def _position_error_m(self) -> NDArray[np.float64] | None:
-        """Standard deviation of receiver position errors along x and y [L], [m]; None if positions are exact."""
+        """Standard deviation [L], [m], of receiver position errors along x and y; None if positions are exact."""
         stated = self.study.links.position_error_m
         if stated is None or not self.links.measured:
             return None
@@ -450,7 +451,7 @@ class Setup:
         return changed
 
     def _with_tracer(self, changed: Setup) -> Setup:
-        """A changed setup with the same tracer, because the tracer does not depend on links or methods."""
+        """A changed setup that keeps the loaded tracer, because the tracer does not depend on links or methods."""
         changed.__dict__["_loaded"] = self._loaded
         known = {name: value for name, value in vars(self).items() if name in ("regions", "_ground")}
         changed.__dict__.update(known)

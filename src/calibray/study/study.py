@@ -52,7 +52,7 @@ class Study(StudyModel):
     Attributes:
         version: Version of the file format.
         scene: The scene and the carrier.
-        objects: Patterns of object names, by the name of the new material that these objects receive.
+        objects: Patterns of object names, keyed by the name of the new material of these objects.
         materials: Constants that override those of the scene, by material name.
         links: The measured links.
         antennas: The antennas.
@@ -90,9 +90,9 @@ class Study(StudyModel):
                 folder if None.
             overwrite: Whether to replace files in the folder that Calibray did not write.
             **sections: Sections of the study file that replace the defaults, such as ``trace={"max_depth": 5}`` or
-                ``links={"quantity": "received_power"}``. For materials, constants and antennas that are not given,
-                those of the scene are kept. Without `parameters`, the permittivities of all materials except air and
-                metal are calibrated.
+                ``links={"quantity": "received_power"}``. Materials, constants and antennas that are not given are those
+                of the scene. Without `parameters`, the permittivities of all materials except air and metal are
+                calibrated.
 
         Returns:
             The study; `Result.apply` sets the calibrated materials in the scene.
@@ -177,9 +177,9 @@ class Study(StudyModel):
         return links_from_table(table, group, links.frequency, steps=steps, tx=links.tx, rx=links.rx)
 
     def _freed_for_join(self, table: SourceTable, steps: Preparation) -> SourceTable:
-        """The table, with new names for columns that the study's links received from the table of transmitters.
+        """The table, with new names for columns that the study's links took from the table of transmitters.
 
-        Without the new names, the joined columns would be renamed, because the columns of the table keep their names.
+        If a column of the table kept such a name, the join would rename the column from the table of transmitters.
         """
         if steps.transmitters is None:
             return table
@@ -234,7 +234,8 @@ def summary(study: StudyModel) -> tuple[Table, Table]:
 
 VALUE: Final = "measured"
 AIR: Final = 1.1
-"""Largest permittivity that counts as air; all other ITU-R P.2040 materials have at least 1.26 (ceiling board)."""
+"""Largest permittivity that counts as air; all other ITU-R P.2040 materials have a permittivity of at least 1.26
+(ceiling board)."""
 
 LARGEST_PERMITTIVITY: Final = 15.0
 """Default upper bound of a calibrated permittivity. The value is more than twice the largest permittivity of a building
@@ -293,7 +294,7 @@ def _write_live_study(
         end: asdict(antenna) | {"orientation": list(antenna.orientation)}
         for end, antenna in zip(ends, live.antennas, strict=True)
     }
-    # The default scattering coefficient of Sionna RT is 0; a 0 stated in the study would count as exact.
+    # The default scattering coefficient of Sionna RT is 0, but a value of 0 stated in the study would count as exact.
     materials = {
         name: {
             key: value for key, value in constants[name].items() if value or key != "scattering_coefficient"

@@ -61,7 +61,7 @@ def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
         agrees = tomllib.loads(text) == _with_lists(content)
     except ValueError:  # a lone surrogate, which no TOML file can contain
         pass
-    # For any names in a table, the file must state exactly the content of the draft.
+    # Whatever names a table contains, the file must state exactly the content of the draft.
     if not agrees:
         raise InputError(
             "draft: the name of a column or group cannot be written in TOML; rename the column or group in the table"
@@ -94,7 +94,7 @@ def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
 
 
 def _commented(item: Any, reason: str | None) -> Any:
-    """An item with a comment on one line, because text after a line break would be read as TOML."""
+    """An item followed by a comment on the same line, because text after a line break would be read as TOML."""
     return item.comment(printable(reason)) if reason else item
 
 

@@ -59,7 +59,7 @@ def trace(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Paths:
-    """Find the paths of every link and compile them.
+    """Find the paths of every link and compile them into a path program.
 
     Args:
         scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a `Scene`. Alternatively, a study that states
