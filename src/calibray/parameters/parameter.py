@@ -327,7 +327,7 @@ def check_material(name: str, materials: Collection[str]) -> None:
 
 
 class PowerLaw(NamedTuple):
-    """Values of a power law s f^e, and the derivatives of these values [...].
+    """Values [...] of a power law s f^e, and the derivatives [...] of these values.
 
     Attributes:
         value: The value.
@@ -341,7 +341,7 @@ class PowerLaw(NamedTuple):
 
 
 def power_law(scale: NDArray[np.float64], exponent: NDArray[np.float64], frequency: float) -> PowerLaw:
-    """Evaluate s f^e, with f in GHz, at one frequency [Hz] for scales s [...] and exponents e [...]."""
+    """Evaluate s f^e, with f in GHz, for scales s [...] and exponents e [...] at one frequency [Hz]."""
     frequency_ghz = frequency / 1e9
     power = frequency_ghz**exponent
     value = scale * power  # ITU-R P.2040-1 eq. 58 and 59

@@ -323,7 +323,7 @@ class Parameters:
         """Convert points of the search space [..., parameters] to candidates within the bounds."""
         values = self._components(points)
         values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, values, 0.0)), values)
-        # Without clipping, rounding in exp and log could exceed the bounds by one unit in the last place.
+        # Without clipping, rounding errors of exp and log could exceed the bounds by one unit in the last place.
         return np.clip(values, self.lower, self.upper)
 
     def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:

@@ -61,15 +61,15 @@ class Geometry:
         delay: Propagation delay [P], [s].
         spreading: Amplitude spreading [P], [1/m].
         departure_direction: Unit vector of departure [P, 3].
-        arrival_direction: Unit vector of the direction of travel at the target [P, 3].
-        departure_rotation: (cos, sin) of the rotation from the basis (theta, phi) of departure into the first frame [P,
-            2].
-        arrival_rotation: (cos, sin) of the rotation from the last frame into the basis (theta, phi) of arrival [P, 2].
+        arrival_direction: Unit vector [P, 3] of the direction of travel at the target.
+        departure_rotation: (cos, sin) [P, 2] of the rotation from the basis (theta, phi) of departure into the first
+            frame.
+        arrival_rotation: (cos, sin) [P, 2] of the rotation from the last frame into the basis (theta, phi) of arrival.
         first: Index of the first interaction of each path [P + 1].
         kind: Kind of every interaction [I].
         material: Index of its material [I].
         cos_incidence: Cosine of the angle of incidence [I].
-        rotation: (cos, sin) of the rotation from the previous frame into the frame of the interaction [I, 2].
+        rotation: (cos, sin) [I, 2] of the rotation from the previous frame into the frame of the interaction.
         diffuse: Table of diffuse interactions.
         diffraction: Table of diffractions.
     """

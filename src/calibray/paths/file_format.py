@@ -120,7 +120,8 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     }
 )
 
-# A correction of 0 would remove a path. Each wall can add hundreds of decibels, in the engine or in the replay.
+# A correction of 0 would remove a path. In the engine and in the replay, the loss through each wall can amount to
+# hundreds of decibels.
 OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
     {"paths/correction": Dataset(("P",), "f", 1e-300, 1e300)}
 )

@@ -47,19 +47,19 @@ class Paths:
         departure: Zenith and azimuth of departure [P, 2], [rad].
         arrival: Zenith and azimuth [P, 2], [rad], of the direction of arrival, which points from the receiver towards
             the source.
-        tx_field: Transmit pattern in the frame of the first interaction [P, T, 2], complex.
-        rx_field: Receive pattern in the frame after the last interaction [P, R, 2], complex.
+        tx_field: Complex transmit pattern [P, T, 2] in the frame of the first interaction.
+        rx_field: Complex receive pattern [P, R, 2] in the frame after the last interaction.
         first: Index of the first interaction of each path [P + 1]; path p has the interactions first[p] to first[p + 1]
             - 1.
         kind: `Kind` of every interaction [I].
         material: Index of the material of every interaction [I].
         cos_incidence: Cosine of the angle of incidence [I].
-        rotation: (cos, sin) of the rotation from the previous frame into the frame of the interaction [I, 2].
+        rotation: (cos, sin) [I, 2] of the rotation from the previous frame into the frame of the interaction.
         vertex: Points of interaction [I, 3], [m], for plots; stored in single precision, or in double precision far
             from the origin. The computed fields do not depend on the points of interaction.
         diffuse: Additional constants of the diffuse interactions.
         diffraction: Additional constants of the diffractions.
-        settings: Settings of the trace, for documentation.
+        settings: Settings of the trace, stored only for documentation.
         correction: Ratio [P] of each path's power in the engine that found the path to its replayed power with the same
             constants. The replayed power is multiplied by this ratio. None if there is no correction.
     """
@@ -120,8 +120,8 @@ class Paths:
     def at(self, frequency: float, materials: Mapping[str, Material] | None = None) -> Paths:
         """The same paths at another carrier frequency; the traced geometry is unchanged.
 
-        With diffuse reflection and refraction, the share of sampled paths depends on the constants at the traced
-        carrier. The estimate remains unbiased at other carriers.
+        With diffuse reflection and refraction, the sampling probabilities of paths depend on the constants at the
+        traced carrier. The estimate remains unbiased at other carriers.
 
         Args:
             frequency: Carrier frequency [Hz].

@@ -47,10 +47,10 @@ class PriorSection(Section):
     """The prior of a parameter: log-normal around a value or another parameter, or Gaussian around the start value.
 
     Attributes:
-        itu: Name of the ITU-R P.2040 material on which the prior is centred, with or without "@REVISION".
+        itu: Name of the ITU-R P.2040 material on whose value the prior is centred, with or without "@REVISION".
         value: Value on which the prior is centred, in the unit of the parameter; an alternative to `itu`.
-        like: Name of another parameter on which the prior is centred; an alternative to `itu`. Both parameters are then
-            members of the same population.
+        like: Name of another parameter on whose value the prior is centred; an alternative to `itu`. Both parameters
+            are then members of the same population.
         spread: Standard deviation of the natural logarithm of the parameter; 0.3 corresponds to about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the unit of the parameter. This key
             replaces `itu`, `value`, `like` and `spread`.
@@ -228,12 +228,13 @@ class NoiseSection(Section):
     Attributes:
         std_db: Standard deviation [dB] of the error of a link; it determines the weight of the priors relative to the
             measurements. If absent, it is estimated.
-        kind: Distribution of the errors: "gaussian", "student-t", or "auto" for intervals that account for both.
+        kind: Distribution of the errors: "gaussian", "student-t", or "auto" for intervals that account for both
+            distributions.
         range_m: Correlation distance [m] of the errors of neighbouring links; 0 for no correlation, or "auto".
         heterogeneity: Spread of a material's constants between buildings; 0 for no spread, or "auto".
-        constants_spread: Standard deviation of the logarithm of a fixed constant (thickness, conductivity, scattering
-            coefficient) of a calibrated material. State 0 if the values in the scene are exact. A scattering
-            coefficient of 0 has a separate prior, unless `constants_spread` is 0.
+        constants_spread: Spread of the fixed constants (thickness, conductivity, scattering coefficient) of a
+            calibrated material, as the standard deviation of the logarithm. State 0 if the values in the scene are
+            exact. A scattering coefficient of 0 has a separate prior, unless `constants_spread` is 0.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
@@ -343,7 +344,7 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     """
     if not options:
         return
-    # Optimizers import SciPy, which a study without options does not need.
+    # Optimizers import SciPy, which is not needed for a study without method options.
     from calibray.optimizers import METHODS, NO_OPTIONS
 
     settings = None

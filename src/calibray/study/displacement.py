@@ -1,7 +1,7 @@
 """Positions as parameters (heights of transmitters, displacements of devices), and errors of receiver positions.
 
-Paths are traced at the stated positions and at displaced positions. Between these positions, the change in path loss
-[dB] is a monotone cubic function of the displacement, for every link and axis.
+Paths are traced at the stated positions and at displaced positions. For every link and axis, the change in path loss
+[dB] between these positions is a monotone cubic function of the displacement.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ LEAST: Final = 0.01
 """Minimum displacement of the outermost knot [m]; it keeps knots distinct if a parameter is at its bound."""
 
 ACROSS: Final = (0.25, 0.5, 0.75, 1.0)
-"""Displacements traced on each side before the calibration, as fractions of the largest displacement. For antenna
-panels of eight rows, traced at heights 2 m apart, the error of the interpolated path loss has a median of 0.1 dB and an
-RMS value of 2 dB. If a parabola is fitted to the path loss at the stated height and at the bounds 8 m above and below,
-the RMS error is 5 dB."""
+"""Displacements at which paths are traced on each side before the calibration, as fractions of the largest
+displacement. For antenna panels of eight rows, traced at heights 2 m apart, the error of the interpolated path loss has
+a median of 0.1 dB and an RMS value of 2 dB. If a parabola is fitted to the path loss at the stated height and at the
+bounds 8 m above and below, the RMS error is 5 dB."""
 
 
 def displaces(name: str) -> bool:

@@ -232,7 +232,7 @@ def _add_averaging(draft: LinksDraft, rx: PositionColumns) -> None:
 
 
 def _add_observables(draft: LinksDraft) -> None:
-    # A row of a wide table contains the powers of several transmitters, but only one flight time or delay spread.
+    # A row of a wide table contains the powers of several transmitters, but only one time of flight or delay spread.
     if "wide" in draft.section:
         return
     if (delay_spread := column_names.find_delay_spread(draft.table.frame)) is not None:
@@ -439,7 +439,7 @@ UNKNOWN: Final = {"pattern": "iso", "polarization": "V"}
 
 
 def add_antennas(links: LinksDraft) -> dict[str, Any]:
-    """Add the columns of transmit antennas to ``[links]``, and return the section ``[antennas]``.
+    """Add the columns that describe transmit antennas to ``[links]``, and return the section ``[antennas]``.
 
     Raises:
         InputError: The folder of antennas cannot be used or has no file for an antenna.

@@ -44,15 +44,15 @@ RECEIVER_HEIGHT: Final = 1.5
 """Default height [m] of a receiver if there is no column of heights; typical of a handheld phone."""
 
 ALTITUDES: Final = frozenset({"alt", "altitude", "altitud", "amsl", "asl", "msl", "nhn", "msnm"})
-"""Words in the names of altitude columns. Their meaning varies: satellite receivers report altitudes above sea level,
-and drones also report altitudes above ground."""
+"""Words in the names of altitude columns. The reference of an altitude varies: satellite receivers report altitudes
+above sea level, and drones also report altitudes above ground."""
 
 TRANSMITTER_HEIGHT: Final = 10.0
 """Default height [m] of a transmitter if there is no column of heights; typical of a small cell on a mast."""
 
 SAME_CARRIER: Final = 0.01
-"""Maximum relative difference between frequencies that count as one carrier. This difference changes free-space loss by
-0.09 dB."""
+"""Maximum relative difference between frequencies that count as one carrier. A difference of this size changes
+free-space loss by 0.09 dB."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ class LinksDraft:
             )  # fmt: skip
 
     def _leave_out_unplaced_receivers(self) -> None:
-        """Draft a filter that excludes rows without a receiver position, for example without a satellite fix."""
+        """Draft a filter that excludes rows without a receiver position, such as rows without a satellite fix."""
         names = [name for name in (self.rx.x, self.rx.y, self.rx.height) if name is not None]
         missing = self.table.frame[names].isna()
         lacking = missing.any(axis=1).to_numpy()
@@ -348,7 +348,8 @@ class LinksDraft:
         if np.array_equal(read, values, equal_nan=True) and len(carriers) <= MAX_CARRIERS:
             self.section["frequency"] = name
             self.assume("links.frequency", name, f"{len(carriers)} carriers in {file.name}")
-            # The tracer samples paths through walls at the lowest carrier, because walls are most transparent there.
+            # The tracer samples paths through walls at the lowest carrier, because walls are most transparent at this
+            # carrier.
             return float(carriers[0]), f"lowest carrier of column {name}"
         if self.given.frequency is None:
             raise InputError(
@@ -447,7 +448,7 @@ class LinksDraft:
 
     @staticmethod
     def _unused_altitudes(frame: pd.DataFrame) -> str:
-        """Hint that an altitude column is ignored, as altitudes may be above sea level; empty without such a column."""
+        """Hint that an altitude column is ignored (it may be above sea level); empty if there is no such column."""
         unused = [str(name) for name in frame if column_names.words(name) & ALTITUDES]
         hint = (
             "is ignored, because altitudes may be above sea level; rename the column 'height' if they are above the "

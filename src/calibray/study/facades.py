@@ -45,10 +45,10 @@ class FacadeSection(Section):
             constants, unless ``[materials]`` states other constants for it.
         storeys: First and last storey, counted from 1 at the ground.
         storey_height: Height of a storey [m].
-        facing: Compass bearings [deg] that limit the direction of the outward normal of the wall, clockwise from the
-            first to the second. The inside of a wall is the side under a roof. Without a roof, the order of the corners
+        facing: Sector of compass bearings [deg], clockwise from the first to the second, that contains the outward
+            normal of the wall. The inside of a wall is the side under a roof. Without a roof, the order of the corners
             of the triangles determines the inside.
-        boxes: Rectangles that contain the wall: west, south, east, north [m] in the scene frame.
+        boxes: Rectangles that contain the parts of walls: west, south, east, north [m] in the scene frame.
         file: GeoJSON, Shapefile, GeoPackage or FlatGeobuf file of polygons. The walls are on the outlines of these
             polygons.
         column: Column of the file. Only polygons with the value NAME in this column are used; without `column`, all
@@ -92,8 +92,8 @@ def with_facade_materials(
     """The scene with the materials of facades; `constants` are those that ``[materials]`` states for facades.
 
     Raises:
-        InputError: A facade has the name of a material, or divides a material that the scene lacks; or ITU-R P.2040
-            does not cover a material at the carrier [Hz].
+        InputError: A facade has the name of a material of the scene, the scene lacks the material that a facade
+            replaces, or ITU-R P.2040 does not cover a material at the carrier [Hz].
     """
     materials, laws = dict(scene.materials), dict(scene.laws)
     for name, section in facades.items():
@@ -215,7 +215,7 @@ def _walls(surfaces: SceneSurfaces, point: NDArray[np.float64]) -> tuple[NDArray
     Each array is [n]. The bearing is that of the outward normal; position 0 is the west or south end.
     """
     shapely, walls = library("shapely", "scenes"), surfaces.walls
-    # In plan, an upright triangle is a line from its first to its last corner in order of x and y.
+    # In plan, an upright triangle is the line from its first to its last corner, with corners sorted by x and y.
     plan = np.round(walls[:, :, :2], 6)
     order = np.lexsort((plan[..., 1], plan[..., 0]), axis=-1)
     ends = np.stack([plan[np.arange(len(plan)), order[:, k]] for k in (0, 2)], axis=1)

@@ -399,7 +399,7 @@ def _levels(study: StudyModel, links: Measurements, overhead: SceneSurfaces) -> 
         max(largest_gain_dbi(antenna) for antenna in link_antennas(study, end, links.table)[0])
         for end in ("tx", "rx")
     )
-    # The smallest possible free-space loss is that along the main directions of the best antennas at both ends.
+    # The smallest possible loss in free space is that between the main directions of the highest-gain antennas.
     excess = free_space - gain - links.path_loss_db
     roofed = overhead.under_roof(links.tx) & overhead.under_roof(links.rx)
     below = excess > np.where(roofed, GUIDED_DB, BELOW_FREE_SPACE_DB)

@@ -33,7 +33,7 @@ patterns of 3GPP TR 38.901 have a lower limit of 30 dB below the maximum gain.""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns of antennas and their directions, and of transmitter names if parameters refer to transmitters."""
+    """The columns of antennas, antenna directions and, if parameters refer to transmitters, transmitter names."""
     columns = [name for section in study.links.mountings.values() for name in section.columns.values()]
     own = [
         name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY + ".")
@@ -171,7 +171,7 @@ def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Pa
 def link_antennas(
     study: StudyModel, end: str, table: SourceTable
 ) -> tuple[tuple[Antenna, ...], NDArray[np.int64]]:
-    """The distinct antennas at one end ("tx" or "rx"), and the index of the antenna of every row [rows].
+    """The distinct antennas at one end ("tx" or "rx"), and the antenna index of every row [rows].
 
     Raises:
         InputError: The column of antennas is missing, or names an unknown antenna.
@@ -194,7 +194,7 @@ def link_antennas(
 def _degrees(
     table: SourceTable, key: str, stated: float | str, limit: int, may_be_empty: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Angles [rows], [deg]. In rows selected by the mask `may_be_empty` [rows], an empty cell counts as 0."""
+    """Angles [rows], [deg]. In rows that the mask `may_be_empty` [rows] selects, an empty cell counts as 0."""
     if isinstance(stated, str) and pd.api.types.is_numeric_dtype(column := table.column(stated)):
         table = table.assign(**{stated: column.mask(column.isna() & may_be_empty, 0.0)})
     values = table.numbers(stated)
@@ -257,7 +257,7 @@ distribution is 0.29 times its width."""
 
 
 def estimated_fields(study: StudyModel) -> tuple[str, ...]:
-    """The transmitter fields whose spread is estimated."""
+    """The antenna fields whose spread across transmitters is estimated."""
     return tuple(
         name.rpartition(".")[2] for name, entry in study.parameters.items() if entry.spread == "auto"
     )

@@ -17,7 +17,7 @@ from calibray.measurements.observables import FLIGHTS, KINDS, PROFILES, SECTORS,
 from calibray.support.strict_models import Section, Text
 
 UNITS: Final = {
-    # A distance stands for the time that light needs to travel this distance.
+    # A distance stands for the time that light takes to travel it.
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "m": 1 / speed_of_light},
     "dB": {"dB": 1.0},
     "rad": {"rad": 1.0, "deg": float(np.pi / 180)},
@@ -25,7 +25,7 @@ UNITS: Final = {
 """Accepted units of each dimension, with their values in SI units."""
 
 FILTERED: Final = "{column} [{name}]"
-"""Name of the column with those values of an observable that pass its filter."""
+"""Name of the column with the values of an observable that pass the filter of this observable."""
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -170,7 +170,7 @@ def by_column(sections: Mapping[str, ObservableSection]) -> dict[str, Observable
             parts = {
                 f"{name}_{number}": section.model_copy(update={
                     "column": column, "columns": (),
-                    # These are the two edges of the bin; the key that does not apply stays empty.
+                    # These are the two edges of the bin; the key that does not apply to this kind stays empty.
                     "edges": section.edges[number - 1 : number + 1],
                     "edges_deg": section.edges_deg[number - 1 : number + 1],
                 })

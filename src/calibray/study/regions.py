@@ -33,8 +33,8 @@ PREFIX: Final = "region:"
 """Prefix of the names of a region's parameters."""
 
 WOODLAND: Final = (1.15, 0.43)
-"""A_1 [dB] and alpha of the maximum loss A_1 f^alpha in woodland, with f in MHz (ITU-R P.833-10, section 2,
-Mulhouse)."""
+"""Coefficients A_1 [dB] and alpha of the maximum loss A_1 f^alpha in woodland, with f in MHz (ITU-R P.833-10, section
+2, Mulhouse)."""
 
 EXPONENT: Final = 0.284
 """Frequency exponent of the specific attenuation. Weissberger (1982): 0.45 f^0.284 dB/m for up to 14 m of dense, dry,
@@ -152,7 +152,7 @@ class RegionSection(Section):
         outline = shapely.intersection(outline, shapely.box(*surfaces.bounds[[0, 1, 3, 4]]))
         inside = np.flatnonzero(~shapely.is_empty(outline))
         outline, bottom, top = outline[inside], bottom[inside], top[inside]
-        # Take a point inside each polygon; the centroid of a non-convex polygon can be outside.
+        # Take a point inside each polygon, because the centroid of a non-convex polygon can be outside.
         ground = surfaces.lowest_surface(*shapely.get_coordinates(shapely.point_on_surface(outline)).T)
         if (missing := inside[np.isinf(ground)]).size:
             raise InputError(
@@ -299,6 +299,6 @@ def _segments(
         # The last segment is computed from its direction and the remaining length of the path.
         before = np.bincount(path[inner], np.linalg.norm(end - start, axis=1)[inner], paths.num_paths)
         last = paths.delay * speed_of_light - before
-        # The arrival direction points from the receiver back along the ray.
+        # The arrival direction points from the receiver back towards the last interaction.
         end[ends] = start[ends] - last[:, None] * wave_basis(paths.arrival)[0].T
     return path, start, end

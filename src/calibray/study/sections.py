@@ -57,8 +57,8 @@ class MaterialSection(Section):
         relative_permittivity: Real part of the relative permittivity [1].
         conductivity: Conductivity [S/m].
         thickness: Thickness [m].
-        scattering_coefficient: Scattering coefficient [1]. A value of 0 in the study is exact, unlike a value of 0 in
-            the scene.
+        scattering_coefficient: Scattering coefficient [1]. A value of 0 stated in the study is taken as exact, unlike a
+            value of 0 in the scene.
         xpd_coefficient: Cross-polarization discrimination coefficient [1].
         scattering_pattern: "lambertian", "directive" or "backscattering".
         alpha_r: Exponent [1] of the lobe around the specular direction.
@@ -142,7 +142,7 @@ class TrackSection(Section):
         file: GPX file, relative to the study file's folder.
         time: Column with the times of the rows, in ISO 8601 or as seconds since 1970.
         longest_gap: Longest permitted time [s] between two track points; rows in longer gaps are excluded.
-        clock: Time [s] by which the clock of the table is ahead of the clock of the track.
+        clock: Time [s] by which the clock that timed the rows is ahead of the clock of the track.
     """
 
     file: Text
@@ -212,7 +212,7 @@ class LinksSection(Section):
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column; required for received powers.
         eirp_dbm: Radiated power in the main direction (EIRP) [dBm], stated instead of the transmitted power.
-        cable_loss_db: Loss between transmitter and antenna [dB], a number or a column; requires a transmitted power.
+        cable_loss_db: Loss [dB] between transmitter and antenna, a number or a column; requires a transmitted power.
         tx_antenna: Antennas of the transmitters, if these differ between links.
         rx_antenna: Antennas of the receivers, if these differ between links.
         device: Column with the names of receiving devices, for parameters such as "rx:PHONE.dx" that displace these
@@ -220,7 +220,7 @@ class LinksSection(Section):
         position_error_m: Standard deviation [m] of receiver position errors along x and y, a number or a column.
         frequency: Column of carrier frequencies, in Hz or in the unit that its name states. If absent, all links have
             the carrier of ``[scene]``.
-        wide: Names of the transmitters by column, for a table with one column per transmitter.
+        wide: Names of the transmitters, keyed by column, for a table with one column per transmitter.
         track: GPX track from which the columns `track_longitude` and `track_latitude` [deg] are added to the rows.
         heights: "ground" for heights above the ground of the scene. If absent, heights are above the vertical datum of
             the scene frame.
@@ -228,8 +228,8 @@ class LinksSection(Section):
         transmitter: Column with the name of the transmitter, in both tables.
         missing: Numbers that stand for missing measurements, in addition to common codes such as 100 or -999.
         noise_floor_dbm: Noise floor [dBm]. A missing received power is treated as below the noise floor.
-        below_floor: Treatment of rows at or below the noise floor: "exclude" removes these rows; "censor" keeps them as
-            upper bounds of the received power, which intervals take into account.
+        below_floor: Treatment of rows with received powers at or below the noise floor: "exclude" removes these rows;
+            "censor" keeps them as upper bounds of the received power, which intervals take into account.
         inside: Treatment of receivers inside buildings: "keep", "drop", or "move" to the nearest point outside.
         average: Rule by which samples are averaged.
     """

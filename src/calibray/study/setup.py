@@ -201,7 +201,7 @@ class Setup:
         return np.array([self.placed.get(item.name, item.start) for item in self.parameters])
 
     def placed_at(self, values: Mapping[str, float], neighbours: tuple[float, ...] = ()) -> Setup:
-        """The setup with paths traced at the antenna positions that the parameter values `values` determine.
+        """The setup with paths traced at the antenna positions that correspond to the parameter values `values`.
 
         The setup is unchanged if no parameter displaces antennas. Path loss is interpolated between these positions and
         `neighbours` on each side (fractions of the largest displacement). Without neighbours, path loss does not depend
@@ -287,7 +287,7 @@ class Setup:
     def _loaded(self) -> dict[str, Any]:
         """The loaded tracer and the digest of its files; empty before loading.
 
-        All setups of one scene share this dictionary.
+        All setups with the same scene share this dictionary.
         """
         return {}
 
@@ -295,7 +295,7 @@ class Setup:
         return cache.files_digest(self.scene, self.study.antenna_pair)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for another process, without the loaded tracer and with the absolute path of the scene."""
+        """The state sent to another process: without the loaded tracer, and with the absolute path of the scene."""
         state = {item.name: getattr(self, item.name) for item in fields(self)}
         return state | {"scene": replace(self.scene, path=self.scene.path.absolute())}
 
@@ -371,7 +371,7 @@ class Setup:
 
     @cached_property
     def _ground(self) -> Ground | None:
-        """Function that returns the height of the lowest surface, or +inf; None if heights are not above the ground."""
+        """Function that returns the height of the lowest surface, or +inf; None if heights are not above ground."""
         return None if self.study.links.heights is None else scene_place(self.study).surfaces().lowest_surface
 
     @cached_property
@@ -411,7 +411,7 @@ class Setup:
         return self._with_tracer(replace(self, links=replace(links, weight=weight)))
 
     def _mounted(self, paths: Paths, scene: Scene, mountings: Mapping[str, Mounting] | None = None) -> Paths:
-        """The paths with the fields of those antennas that differ between links, and with the materials of facades."""
+        """The paths with the antenna fields of each link, if antennas differ, and with the materials of facades."""
         study, mountings = self.study, self.mountings if mountings is None else mountings
         paths = mount(paths, mountings) if mountings else paths
         if not study.facades:

@@ -43,7 +43,7 @@ def read_content(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text; save the file as UTF-8") from None
     except (ValueError, RecursionError) as error:
-        # The cause can also be a number with thousands of digits, or lists nested thousands of levels deep.
+        # The parser also fails on numbers with thousands of digits and on lists nested thousands of levels deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
 
 
