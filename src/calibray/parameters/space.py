@@ -46,7 +46,7 @@ class Parameters:
 
     Attributes:
         items: The parameters, at least one.
-        frequency: Carrier frequency at which laws are evaluated by default [Hz].
+        frequency: Carrier frequency [Hz] at which laws are evaluated by default.
         laws: Laws by material, for materials with a calibrated coefficient. The other coefficients are fixed at the
             values of these laws. By default, the constants do not depend on frequency.
 
@@ -144,10 +144,10 @@ class Parameters:
     def constants_and_slopes(
         self, candidates: ArrayLike, frequency: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Constants that candidates determine at one carrier, and derivatives of the constants, both [..., parameters].
+        """Constants [..., parameters] that candidates determine at one carrier, and derivatives of these constants.
 
-        If `frequency` is None, the carrier is that of the parameters. Both coefficients of a law yield the constant
-        that they determine together.
+        The derivatives have the same shape as the constants. If `frequency` is None, the carrier is that of the
+        parameters. Both coefficients of a law yield the constant that they determine together.
 
         Raises:
             InputError: The candidates have the wrong length.
@@ -262,7 +262,7 @@ class Parameters:
         return {name: replace(material, **changes.get(name, {})) for name, material in base.items()}
 
     def matrix_indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row and column of each material parameter in a matrix of constants [materials, fields].
+        """Row and column of each material parameter in a matrix [materials, fields] of constants.
 
         Replay uses these indices to insert candidates: ``constants.at[..., rows, columns].set(candidates)``.
         Coefficients of frequency laws have no entry; use the parameters of `at_carrier` instead.
@@ -327,7 +327,7 @@ class Parameters:
         return np.clip(values, self.lower, self.upper)
 
     def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:
-        """Derivatives of parameter values with respect to the search coordinates at candidates [..., parameters]."""
+        """Derivatives [..., parameters] of parameter values by search coordinates at candidates [..., parameters]."""
         # The derivative of exp(u) is exp(u), the value itself.
         return np.where(self.logarithmic, self._components(candidates), 1.0)
 

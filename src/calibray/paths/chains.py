@@ -30,8 +30,8 @@ class Chains:
         target: End of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
         normal: Normals [P, D, 3] of the surfaces at the interactions; each can point to either side of the surface.
-        kind: Kinds of interaction [P, D]; 0 after the last interaction.
-        material: Index of the material of every interaction [P, D].
+        kind: Kinds [P, D] of the interactions; 0 after the last interaction.
+        material: Material index [P, D] of every interaction.
         probability: Probability [P, D] with which the tracer chose the kind of interaction.
         samples: Number of rays launched per source.
         edge: Directions of the diffracting edges [P, D, 3], read only at diffractions; empty without diffraction.
@@ -65,10 +65,10 @@ class Geometry:
         departure_rotation: (cos, sin) [P, 2] of the rotation from the basis (theta, phi) of departure into the first
             frame.
         arrival_rotation: (cos, sin) [P, 2] of the rotation from the last frame into the basis (theta, phi) of arrival.
-        first: Index of the first interaction of each path [P + 1].
+        first: Index [P + 1] of the first interaction of each path.
         kind: Kind of every interaction [I].
         material: Index of its material [I].
-        cos_incidence: Cosine of the angle of incidence [I].
+        cos_incidence: Cosine [I] of the angle of incidence.
         rotation: (cos, sin) [I, 2] of the rotation from the previous frame into the frame of the interaction.
         diffuse: Table of diffuse interactions.
         diffraction: Table of diffractions.
@@ -231,8 +231,8 @@ def rotate(
 ) -> NDArray[np.float64]:
     """(cos, sin) [..., 2] of the angle by which the frame of a Jones vector is rotated about the direction of travel.
 
-    The vector (a, b) becomes (cos a + sin b, -sin a + cos b). `current` and `target` are the first axes of both frames
-    [..., 3].
+    The vector (a, b) becomes (cos a + sin b, -sin a + cos b). `current` and `target` [..., 3] are the first axes of the
+    two frames.
     """
     return np.stack([_dot(current, target), _dot(direction, _cross(current, target))], axis=-1)
 

@@ -352,7 +352,7 @@ def _block(file: BinaryIO) -> bytes:
 
 
 KNOWN_BYTES: Final = 2**20
-"""Limit on the total size of the entries for known files [bytes]. Each entry takes 32 bytes."""
+"""Limit [bytes] on the total size of the entries for known files. Each entry takes 32 bytes."""
 
 _CODE: Final = """
 from calibray.errors import InputError

@@ -26,9 +26,9 @@ class Diffuse:
         rotation: (cos, sin) [D, 2] of the rotation from the transverse electric frame into the spherical basis (theta,
             phi) of the incident direction. The XPD matrix acts in this basis.
         solid_angle: Solid angle [D], [sr], of the ray tube, divided by the sampling probability in the trace.
-        cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
-        cos_specular: Cosine of the angle between the scattered and specular directions [D].
-        cos_backward: Cosine of the angle between the scattered direction and the direction back to the source [D].
+        cos_scattered: Cosine [D] of the angle between the scattered direction and the normal.
+        cos_specular: Cosine [D] of the angle between the scattered and specular directions.
+        cos_backward: Cosine [D] of the angle between the scattered direction and the direction back to the source.
     """
 
     rotation: NDArray[np.float64]
@@ -50,11 +50,11 @@ class Diffraction:
     The cosine of incidence on the 0-face is in `Paths.cos_incidence`.
 
     Attributes:
-        cos_incidence_n: Cosine of the angle of incidence on the n-face [W].
-        exterior_angle: Exterior angle of the wedge [W], [rad].
-        azimuth_in: Azimuth phi' of the incident ray around the edge, measured from the 0-face [W], [rad].
-        azimuth_out: Azimuth phi of the diffracted ray, measured from the 0-face [W], [rad].
-        sin_edge: Sine of the angle beta_0 between the ray and the edge [W].
+        cos_incidence_n: Cosine [W] of the angle of incidence on the n-face.
+        exterior_angle: Exterior angle [W], [rad], of the wedge.
+        azimuth_in: Azimuth phi' [W], [rad], of the incident ray around the edge, measured from the 0-face.
+        azimuth_out: Azimuth phi [W], [rad], of the diffracted ray, measured from the 0-face.
+        sin_edge: Sine [W] of the angle beta_0 between the ray and the edge.
         distance: L = s s' sin^2(beta_0) / (s + s') [W], [m].
         rotations: (cos, sin) [W, 4, 2] of the four rotations between the edge-fixed frames and the transverse electric
             frames of the faces: in 0, out 0, in n, out n.

@@ -27,7 +27,7 @@ from calibray.support.messages import first_line
 from calibray.support.output_files import as_path, check_file, check_space, exists, replacing
 
 _WIDTH: Final = 80
-"""Maximum length of a line in the summary [characters]."""
+"""Maximum length [characters] of a line in the summary."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,11 +49,10 @@ class Paths:
             the source.
         tx_field: Complex transmit pattern [P, T, 2] in the frame of the first interaction.
         rx_field: Complex receive pattern [P, R, 2] in the frame after the last interaction.
-        first: Index of the first interaction of each path [P + 1]; path p has the interactions first[p] to first[p + 1]
-            - 1.
+        first: Index [P + 1] of each path's first interaction; path p has the interactions first[p] to first[p + 1] - 1.
         kind: `Kind` of every interaction [I].
-        material: Index of the material of every interaction [I].
-        cos_incidence: Cosine of the angle of incidence [I].
+        material: Material index [I] of every interaction.
+        cos_incidence: Cosine [I] of the angle of incidence.
         rotation: (cos, sin) [I, 2] of the rotation from the previous frame into the frame of the interaction.
         vertex: Points of interaction [I, 3], [m], for plots; stored in single precision, or in double precision far
             from the origin. The computed fields do not depend on the points of interaction.
@@ -114,7 +113,7 @@ class Paths:
 
     @property
     def links_without_path(self) -> NDArray[np.int64]:
-        """Indices of the links without a path [links]."""
+        """Indices of the links without a path."""
         return np.flatnonzero(np.bincount(self.link, minlength=self.num_links) == 0)
 
     def at(self, frequency: float, materials: Mapping[str, Material] | None = None) -> Paths:
@@ -137,7 +136,7 @@ class Paths:
         return replace(self, frequency=check_frequency(frequency), materials=self._with_materials(materials))
 
     def material_table(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
-        """Constants of the materials as a matrix [M, 8]. Materials that are not named keep the constants of the trace.
+        """Matrix [M, 8] of material constants. Materials that are not named keep the constants of the trace.
 
         Rows are in the order of `Paths.materials`, and columns in the order of `calibray.materials.FIELDS`.
 

@@ -154,8 +154,8 @@ class OffsetSection(Section):
 
     Attributes:
         per: Column of group labels, or several columns whose labels are joined. If absent, all links share one offset.
-        bounds: Lower and upper bounds of the offset [dB]; unbounded if absent.
-        prior_db: Standard deviation of a Gaussian prior around zero [dB]. If absent, the prior is flat.
+        bounds: Lower and upper bounds [dB] of the offset; unbounded if absent.
+        prior_db: Standard deviation [dB] of a Gaussian prior around zero. If absent, the prior is flat.
     """
 
     per: Text | tuple[Text, ...] | None = None

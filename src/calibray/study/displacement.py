@@ -180,7 +180,7 @@ def displacement_loss(
 
     Args:
         displacements: The K displacements.
-        placed: The parameters of the study, and the parameter values at which the paths are traced [d].
+        placed: The parameters of the study, and their values [d] at which the paths are traced.
         neighbours: Distances to the n neighbouring positions on each side, as fractions of the largest displacement, in
             ascending order.
         links: The L links at the positions that these values determine.

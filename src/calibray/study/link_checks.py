@@ -305,7 +305,7 @@ def _far_transmitters(
 
 
 def _far(bounds: NDArray[np.float64], positions: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
-    """The distance [m] beyond which positions are far from the scene, and the mask of far positions [n]."""
+    """The distance [m] beyond which positions are far from the scene, and the mask [n] of far positions."""
     low, high = bounds[:2], bounds[3:5]
     # The limit is at least one kilometre, because the scene may be a room.
     furthest = FAR * max(float(np.max(high - low)), 100.0)
@@ -319,7 +319,7 @@ def refuse_far_receivers(
     """Raise an error if all receivers are farther from the scene than `FAR` times its size.
 
     Args:
-        bounds: West, south, bottom, east, north and top of the scene [6], [m].
+        bounds: Bounds [6], [m], of the scene: west, south, bottom, east, north and top.
         rx: Positions of the receivers [n, 3], [m].
         source: The table that contains the receivers.
         is_geographic: Whether the positions in the table are in degrees.

@@ -388,7 +388,7 @@ class StudyModel(StudyContent, ABC):
             raise InputError(f"{self._path}: {name} = {file!r}: {error}") from None
 
     def held_out(self, links: Measurements) -> NDArray[np.bool_]:
-        """Mask of the held-out links [L]; all False without ``[holdout]`` or if links are held out in turn.
+        """Mask [L] of the held-out links; all False without ``[holdout]`` or if links are held out in turn.
 
         Raises:
             InputError: The filter is malformed, names a missing column, or selects all links or none; or the links lack

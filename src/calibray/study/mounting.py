@@ -158,7 +158,7 @@ def pose_effects(
 
 
 def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Parameter]) -> NDArray[np.str_]:
-    """Transmitter name of every row [rows]; empty strings if all parameters apply to every transmitter.
+    """Transmitter names [rows]; empty strings if all parameters apply to every transmitter.
 
     Raises:
         InputError: The column of transmitters is missing.

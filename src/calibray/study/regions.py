@@ -113,7 +113,7 @@ class RegionSection(Section):
         return next(((key, name) for key, name in stated if name is not None), None)
 
     def largest_loss_db(self, frequency: float) -> float:
-        """Loss of a very long path inside the region at a carrier [Hz], [dB]."""
+        """Loss [dB] of a very long path inside the region at a carrier [Hz]."""
         scale, exponent = WOODLAND
         return scale * (frequency / 1e6) ** exponent if self.maximum_db is None else self.maximum_db
 

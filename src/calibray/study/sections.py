@@ -27,7 +27,7 @@ class SceneSection(Section):
     Attributes:
         file: Mitsuba XML file, relative to the study file's folder, or "sionna:NAME" for a bundled scene.
         frequency: Carrier frequency [Hz].
-        bandwidth: Bandwidth over which power is averaged [Hz].
+        bandwidth: Bandwidth [Hz] over which power is averaged.
         origin: Longitude and latitude [deg] of the origin of the scene, for geographic positions.
         crs: Projection of the x and y coordinates of the scene, for instance "EPSG:32632". If absent, a local
             projection around the origin is used.
@@ -97,7 +97,7 @@ class AverageSection(Section):
     Attributes:
         by: "place" averages samples at the same receiver position, "cell" in cells of a square grid, "distance" in
             intervals of the travelled distance (in row order), and "time" in time windows.
-        size: Width of a cell or length of an interval [m], or duration of a window [s]; required except for "place".
+        size: Width [m] of a cell, length [m] of an interval, or duration [s] of a window; required except for "place".
         time: Column of times; allowed only with "time".
         unbiased: Whether to correct for the biased logarithm of a mean over few samples.
         minimum_count: Minimum number of samples in an average; averages over fewer samples are excluded.

@@ -74,7 +74,7 @@ class Setup:
         scene: The scene with the start values of the parameters, because the materials affect how the tracer samples
             paths.
         parameters: The parameters, in the order of the values of a candidate.
-        held_out: Mask of the held-out links [L].
+        held_out: Mask [L] of the held-out links.
         factory: Function that opens the scene in a ray tracer.
         placed: Values of the parameters at which paths are traced, if parameters displace antennas; by default, the
             start values.
@@ -301,7 +301,7 @@ class Setup:
 
     @property
     def carriers(self) -> dict[float, dict[str, Material]]:
-        """Materials before calibration, by carrier [Hz]; empty if all links use the carrier of the study."""
+        """Materials before calibration, keyed by carrier [Hz]; empty if all links use the carrier of the study."""
         return self._materials_by_carrier
 
     @cached_property
