@@ -327,7 +327,7 @@ class Parameters:
         return np.clip(values, self.lower, self.upper)
 
     def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:
-        """Derivatives of parameter values with respect to search coordinates; shape of `candidates`, [..., parameters]."""
+        """Derivatives of parameter values with respect to search coordinates, at candidates [..., parameters]."""
         # The derivative of exp(u) is exp(u), the value itself.
         return np.where(self.logarithmic, self._components(candidates), 1.0)
 
