@@ -1,7 +1,7 @@
 """Assignment of positions to buildings: objects that touch in plan form one building.
 
 The edges of all triangles except those of the ground are rasterized in plan. Cells that touch, even if only at corners,
-form one building. Streets therefore separate buildings, but a row of houses, or a wall with its windows, is one
+form one building. Streets therefore separate buildings, but a row of houses, or a wall with its windows, counts as one
 building.
 """
 
@@ -24,11 +24,11 @@ MAX_CELLS: Final = 8_000_000
 """Maximum number of raster cells, to limit memory use; larger scenes have wider cells."""
 
 MAX_POINTS: Final = 2_000_000
-"""Maximum number of points along edges in memory at once."""
+"""Maximum number of points along edges that are in memory at the same time."""
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index [n] of the building that contains each position [n, 3], [m], or is nearest to it in plan.
+    """For each position [n, 3], [m], index [n] of the building that contains it or is nearest to it in plan.
 
     All indices are -1 if the scene consists only of ground.
     """
@@ -41,7 +41,7 @@ def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDA
         return np.full(len(position), -1)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cell = max(CELL, float(np.sqrt(np.prod(np.maximum(high - low, CELL)) / MAX_CELLS)))
-    # Corners at the upper bounds need one additional cell.
+    # Corners at the upper bounds require one additional cell.
     built = np.zeros(tuple(((high - low) / cell).astype(np.int64) + 1), dtype=bool)
     for point in _edge_cells((corners - low) / cell):
         built[point[:, 0], point[:, 1]] = True
@@ -74,7 +74,7 @@ def _edge_cells(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
 def footprints(
     triangles: Triangles, west: float, south: float, east: float, north: float
 ) -> list[NDArray[np.float64]]:
-    """Outlines of all level surfaces except the ground that are wholly or partly within the given bounds [m].
+    """Outlines of the level surfaces, other than the ground, that lie wholly or partly within the given bounds [m].
 
     The outlines are closed lines [n, 2], [m]; the first corner is not repeated.
     """
@@ -83,7 +83,7 @@ def footprints(
     corners = triangles.corners
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     least, most = np.array([west, south]), np.array([east, north])
-    # Faces near the area are included, because the outline of half a roof would be wrong.
+    # Faces near the area are also included, because a roof cut off at the bounds would have a wrong outline.
     around = (most - least) / 2
     inside = (high > least - around).all(axis=1) & (low < most + around).all(axis=1)
     lying = (np.abs(normal[:, 2]) > LEVEL * area) & (area > 0)

@@ -3,9 +3,9 @@
 Sionna RT finds wedges only between faces that share vertices within one mesh. Where two meshes meet, there is no wedge
 and therefore no diffraction.
 
-Mitsuba does not validate mesh files. If a vertex index is out of range, the process crashes or a reflection is missing
+Mitsuba does not validate mesh files. If a vertex index is out of range, the process crashes, or reflections are lost
 without a message. Rays never hit faces with NaN vertices. `read_mesh` refuses such files. Integer coordinates are
-valid, but cause Mitsuba to lose all reflections from the mesh, so the tracer reads a floating-point copy.
+valid, but with them Mitsuba loses all reflections from the mesh. The tracer therefore reads a floating-point copy.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LARGEST_COORDINATE: Final = 1e9
 """Maximum coordinate of a vertex or an antenna [m]; the same limit applies to positions in path files."""
 
 SMALL: Final = 4096
-"""Maximum size of a PLY file whose mesh is cached within a process [bytes], such as the file of one building. A run
+"""Maximum size [bytes] of a PLY file, such as the file of one building, whose mesh is cached within a process. A run
 reads its scene up to five times. Reading a scene of 2,367 buildings takes 2.8 s the first time and 0.8 s after that."""
 
 _HEADER: Final = re.compile(
@@ -54,7 +54,7 @@ class Mesh:
 
     Attributes:
         vertices: Positions [V, 3], [m].
-        faces: Vertex indices of each triangle, counter-clockwise when seen from outside [F, 3].
+        faces: Vertex indices of each triangle [F, 3], counter-clockwise when seen from outside.
         step: Spacing of floating-point numbers at the largest coordinate in the file [m]; 0 if it is negligible.
         misread: Whether the tracer must read a PLY copy instead, because the file stores integer coordinates, Mitsuba
             would shear the shape, or the shape is a rectangle, which is not a mesh in Mitsuba.
@@ -82,7 +82,7 @@ class MeshObject:
 
 
 def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
-    """Join one or more meshes; vertices of different meshes stay separate, and unused vertices are dropped."""
+    """Join one or more meshes; vertices of different meshes are not merged, and unused vertices are dropped."""
     parts = list(meshes)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])

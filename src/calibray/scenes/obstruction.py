@@ -1,9 +1,9 @@
 """Obstruction of links by buildings and regions of extra loss, and link columns computed from the scene.
 
 The straight line between the ends of a link can pass through buildings, over roofs and through walls. Buildings extend
-from the ground to their roofs, so a line is inside a building where a roof is above the line. All lengths are computed
-from the crossings of the line with the scene's triangles, in plan for roofs and in space for walls. Regions of extra
-loss, such as trees, are vertical prisms over polygons, through which rays pass undeflected.
+from the ground to their roofs, so a line is inside a building wherever a roof is above the line. All lengths are
+computed from the points at which the line crosses the scene's triangles, in plan for roofs and in three dimensions for
+walls. Regions of extra loss, such as trees, are vertical prisms over polygons, through which rays pass undeflected.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from calibray.scenes.triangles import BATCH, LEVEL, Triangles, read_triangles, v
 from calibray.support.lazy_imports import library
 
 STEP: Final = 5.0
-"""Spacing of the points at which a line's height above ground is computed [m]. With this spacing, lengths of paths
-through a wood on hills 50 m high have errors of 0.1 m."""
+"""Spacing of the points at which a line's height above ground is computed [m]. With this spacing, the path length
+through a wood on hills 50 m high has an error of 0.1 m."""
 
 LINES: Final = 5000
 """Maximum number of lines processed at once; each line can have hundreds of steps."""
@@ -48,7 +48,7 @@ class Region:
     ground: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]] | None = None
 
     def length_inside(self, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Length inside the region [k], [m], of straight lines from `start` to `end` [k, 3], [m].
+        """Length [k], [m], of the part inside the region of each straight line from `start` to `end` [k, 3], [m].
 
         Raises:
             InputError: shapely is not installed.
@@ -60,7 +60,8 @@ class Region:
             >>> belt.length_inside(start, end).tolist()
             [20.0, 0.0]
         """
-        # Over hilly ground, each line is divided into steps, so lines are processed in batches.
+        # Over hilly ground, each line is divided into many steps, so lines are processed in batches to limit memory
+        # use.
         parts = [self._lengths(start[k : k + LINES], end[k : k + LINES]) for k in range(0, len(start), LINES)]
         return np.concatenate([np.zeros(0), *parts])
 
@@ -86,7 +87,7 @@ class Region:
         piece = shapely.get_type_id(parts) == 1  # a line that only touches a corner gives a point
         parts, of = parts[piece], sloping[of[piece]]
         ends = np.stack([shapely.get_coordinates(shapely.get_point(parts, k)) for k in (0, -1)], axis=1)
-        # Fractions of the line at which the pieces begin and end, by projection in plan.
+        # Fractions of the line at which the parts inside a prism begin and end, by projection in plan.
         away = ((ends - start[line[of], None, :2]) * step[of, None, :2]).sum(axis=2) / plan[of, None] ** 2
         away = np.clip(np.sort(away, axis=1), low[of, None], high[of, None])
         spans.append(np.column_stack([line[of], away, prism[of]])[away[:, 1] > away[:, 0]])
@@ -97,7 +98,7 @@ class Region:
     def _over_ground(
         self, spans: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """The parts of spans (line, lower, upper, prism) inside the prism over uneven ground, computed step by step."""
+        """The parts of spans (line, lower, upper, prism) inside prisms over uneven ground, computed step by step."""
         if self.ground is None:
             return spans
         step = (end - start)[spans[:, 0].astype(np.int64)]
@@ -118,13 +119,13 @@ class Region:
 def united(
     spans: NDArray[np.float64],
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """Merge overlapping spans (line, lower, upper, ...), and yield the line, lower end and upper end of all pieces."""
+    """Merge overlapping spans (line, lower, upper, ...), and yield the line and both ends of each merged span."""
     count = len(spans)
     if not count:
         return
     event = np.concatenate([spans[:, [0, 1]], spans[:, [0, 2]]])
     change = np.repeat([1, -1], count)
-    # Where one span ends and another begins, the beginning is sorted first, so that the two spans form one piece.
+    # Where one span ends and another begins, the beginning is sorted first, so that the two spans are merged.
     order = np.lexsort((-change, event[:, 1], event[:, 0]))
     depth = np.cumsum(change[order])
     begins = (depth == 1) & (change[order] == 1)
@@ -139,7 +140,7 @@ def _between(
     bottom: NDArray[np.float64],
     top: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The part of each line between two heights, as two fractions [k]; it is empty if the first fraction is larger."""
+    """The part of each line between two heights, as two fractions [k]; the part is empty if the first is larger."""
     rise = last - first
     # A level line is between the heights along its whole length or nowhere.
     level = np.abs(rise) < 1e-9
@@ -155,9 +156,9 @@ OUT_OF_SIGHT: Final = "out_of_sight"
 WALLS: Final = "walls_crossed"
 
 OBSTACLES: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
-"""Link columns computed from a scene: whether the straight line between the ends is blocked, the number of walls that
-the line crosses, its length inside buildings [m], and the knife-edge diffraction loss of the dominant roof edge
-[dB]."""
+"""Link columns computed from a scene: whether the line of sight is blocked, the number of walls that the straight line
+between the ends crosses, the length of this line inside buildings [m], and the knife-edge diffraction loss of the
+dominant roof edge [dB]."""
 
 SAME_CROSSING: Final = 1e-3
 """Distance below which two crossings count as one, for example on an edge that two triangles share [m]."""
@@ -173,8 +174,9 @@ class Obstruction:
     Attributes:
         length_m: Length inside buildings [n], [m].
         walls: Number of walls crossed [n].
-        clearance: Largest Fresnel parameter of a roof edge at a wavelength of 1 m [n]; -inf if a line crosses no roof.
-        other_floor: Whether a floor that spans the scene lies between the ends [n].
+        clearance: Largest Fresnel parameter of a roof edge at a wavelength of 1 m [n]; -inf for a line that crosses no
+            roof.
+        other_floor: Mask [n] of the links with a floor that spans the scene between their ends.
     """
 
     length_m: NDArray[np.float64]
@@ -189,7 +191,7 @@ class Obstruction:
 
     @property
     def out_of_sight(self) -> NDArray[np.bool_]:
-        """Whether a wall, a roof or a floor is between the ends [n]."""
+        """Mask [n] of the links without line of sight: a wall, a roof or a floor is between the ends."""
         return (self.length_m > 0) | (self.walls > 0) | self.other_floor
 
     def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
@@ -234,7 +236,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
         # Roofs below the line give a clearance but no span.
         inside = below[:, 1] > below[:, 0]
         spans.append(np.column_stack([line.astype(np.float64), below])[inside])
-    # A length below several roofs, such as the floors of one building, counts once.
+    # A length below several level surfaces, such as the roof and floors of one building, counts once.
     for line, lower, upper in united(np.concatenate([np.zeros((0, 3)), *spans])):
         np.add.at(length, line, upper - lower)
     length *= np.linalg.norm(end - start, axis=1)
@@ -286,16 +288,17 @@ def _pairs(
         lines = np.flatnonzero(of.reshape(-1) == number)
         lines = lines[np.argsort(azimuth[lines], kind="stable")]
         sorted_azimuth = azimuth[lines]
-        # The azimuths are repeated one turn later, so that a range of azimuths across 180 degrees is contiguous.
+        # The azimuths are repeated with one full turn added, so that a range of azimuths across 180 degrees is
+        # contiguous.
         twice = np.concatenate([sorted_azimuth, sorted_azimuth + 2 * np.pi])
         relative = corners[:, :, :2] - origin
         direction = np.arctan2(relative[..., 1], relative[..., 0])
         # Azimuths are relative to the first corner, in (-pi, pi], so that a range across 180 degrees stays contiguous.
         turn = np.angle(np.exp(1j * (direction - direction[:, :1])))
         low, high = direction[:, 0] + turn.min(axis=1), direction[:, 0] + turn.max(axis=1)
-        around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on its side
+        around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on one of its sides
         low, high = np.where(around, -np.pi, low) - 1e-12, np.where(around, np.pi, high) + 1e-12
-        # `twice` covers -pi to 3 pi; ranges that begin below -pi are searched one turn later.
+        # `twice` covers -pi to 3 pi; ranges that begin below -pi are shifted by a full turn.
         shift = np.where(low < -np.pi, 2 * np.pi, 0.0)
         begin = np.searchsorted(twice, low + shift, "left")
         count = np.searchsorted(twice, high + shift, "right") - begin
@@ -316,15 +319,16 @@ def _pairs(
 def _under(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Parts of lines below level triangles [n, 2], as fractions of the line, and Fresnel parameters of the edges.
+    """Parts [n, 2] of lines below level triangles, as fractions of the line, and Fresnel parameters of the edges.
 
-    The part of the line within the triangle in plan is found by clipping at the triangle's three sides.
+    In plan, the line is clipped at the three sides of the triangle.
     """
     step = last - first
     low, high = np.zeros(len(first)), np.ones(len(first))
     orientation = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Clip the line at the three sides of the triangle in plan (Cyrus and Beck); `sign` makes the inside positive.
+        # Clip the line at the three sides of the triangle in plan (Cyrus and Beck); `sign` makes distances inside the
+        # triangle positive.
         for k in range(3):
             side = corners[:, (k + 1) % 3] - corners[:, k]
             sign = np.sign(orientation)
@@ -336,7 +340,7 @@ def _under(
             # A line that is parallel to a side and outside it misses the triangle.
             high = np.where((slope == 0) & (distance < 0), -1.0, high)
         over = high > low
-        # Height of the triangle's plane above the line, which varies linearly along the line.
+        # Height of the triangle's plane above the line; this height varies linearly along the line.
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         ends = np.stack([low, high])
         point = first + ends[..., None] * step
@@ -364,7 +368,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 def crossing(
     first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distance from the first end at which each line crosses its triangle [n], [m]; NaN where it does not cross.
+    """Distance [n], [m], from each line's first end to its crossing with its triangle; NaN without a crossing.
 
     Intersection with the triangle in barycentric coordinates u and v (Moeller and Trumbore, J. Graphics Tools 2(1),
     1997). For a line parallel to the triangle, the division by zero yields NaN, which fails all comparisons.
@@ -393,7 +397,7 @@ CLUSTER: Final = "cluster"
 """Column with the label of the grid square that contains the receiver, for grouping links."""
 
 COLUMNS: Final = (*OBSTACLES, REGION, CLUTTER)
-"""The numeric columns computed from the scene and the positions."""
+"""The numeric columns that are computed from the scene and the positions."""
 
 
 def with_obstruction(
@@ -405,7 +409,7 @@ def with_obstruction(
     clutter: bool = False,
     cluster_m: float | None = None,
 ) -> Measurements:
-    """Add the columns computed from the scene to links; existing columns with these names are kept.
+    """Add to links the columns computed from the scene; existing columns with these names are kept.
 
     Args:
         links: The links.
@@ -413,8 +417,8 @@ def with_obstruction(
         frequency: Carrier frequency [Hz], used if the links do not state a frequency.
         regions: The regions of extra loss by name; `REGION` is added only if there are regions.
         clutter: Whether to add `CLUTTER`.
-        cluster_m: Side length of the grid squares for `CLUSTER` [m], one of which has a corner at the origin; None to
-            omit the column.
+        cluster_m: Side length [m] of the grid squares for `CLUSTER`; the origin is a corner of the grid. None omits the
+            column.
 
     Raises:
         InputError: A carrier frequency is outside the range of the clutter loss.
@@ -435,7 +439,7 @@ def with_obstruction(
 
 
 def cluster_labels(position: NDArray[np.float64], side: float) -> NDArray[np.str_]:
-    """The grid square of each position [n, 3], [m], as "column row" [n]; `side` is the side length of a square [m]."""
+    """Label "column row" [n] of the grid square of each position [n, 3], [m]; the squares are `side` [m] wide."""
     return np.array([f"{column} {row}" for column, row in np.floor(position[:, :2] / side).astype(int)])
 
 

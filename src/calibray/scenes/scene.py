@@ -1,9 +1,9 @@
 """Scenes: reading the materials and objects of a Mitsuba XML file, and rewriting the file for the tracer.
 
-In the scene for the tracer, each surface material is a plain Sionna `radio-material` with explicit constants and a name
-that Calibray chooses. This approach keeps the constants in one place (`Material`) and allows frequencies outside the
-range of an ITU law if the study gives the constants (NVlabs/sionna-rt#71, #72). The chosen names also avoid conflicts
-with Sionna's naming rules: an ITU name needs the prefix `itu_`, and an object must not have the name of a material.
+In the file for the tracer, each surface material is a plain Sionna `radio-material` with explicit constants and a name
+that Calibray chooses. All constants are therefore in one place (`Material`), and a study that gives the constants can
+use frequencies outside the range of an ITU law (NVlabs/sionna-rt#71, #72). The chosen names also avoid conflicts with
+Sionna's naming rules: an ITU name needs the prefix `itu_`, and an object must not have the name of a material.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Scene:
         materials: The materials that objects use, by name, with their constants at `frequency`.
         objects: The meshes, in file order.
         xml: XML of the scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
-        laws: Frequency law of each material: the law of ITU-R P.2040 for ITU materials, otherwise constant.
+        laws: Frequency law of each material: the law of ITU-R P.2040 for an ITU material, otherwise a constant law.
         sizes: Bounds and size of each object.
         frequency: The frequency for which the scene was read [Hz]; None if the constants are valid at all frequencies.
     """
@@ -191,7 +191,7 @@ def has_copied_meshes(scene: Scene) -> bool:
 
 
 def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
-    """Write copies of meshes in the local frame to a folder, and make the XML with which the tracer loads them.
+    """Write copies of the meshes in the local frame to a folder, and make the XML with which the tracer loads them.
 
     Raises:
         InputError: A mesh cannot be copied.
@@ -263,7 +263,7 @@ def _matches(object_name: str, pattern: str) -> bool:
 def _split_name(
     object_name: str, split: Mapping[str, str], definitions: Mapping[str, ElementTree.Element]
 ) -> str | None:
-    """The separate material of an object, from the first matching pattern; None if no pattern matches."""
+    """Name of an object's separate material, from the first pattern that matches; None if no pattern matches."""
     name = next((name for name, pattern in split.items() if _matches(object_name, pattern)), None)
     if name is None:
         return None
@@ -278,7 +278,7 @@ def _split_name(
 def _merge(
     base: Material | Mapping[str, object] | None, specific: Material | Mapping[str, object] | None
 ) -> Material | Mapping[str, object] | None:
-    """Merge constants given for a material with constants given for some of its objects; the latter take precedence."""
+    """Merge the constants of a material with the constants given for some of its objects, which take precedence."""
     if specific is None or isinstance(specific, Material) or base is None:
         return base if specific is None else specific
     if isinstance(base, Material):
@@ -294,7 +294,7 @@ def _material(
     frequency: float,
     path: Path,
 ) -> tuple[Material, ItuLaw]:
-    """The constants of a material, from the override or otherwise from the file, and their frequency law."""
+    """The constants of a material and their frequency law; the override takes precedence over the file."""
     if isinstance(override, Material):
         return override, frequency_independent_law(override)
     constants = {key: value for key, value in (override or {}).items() if value is not None}
@@ -335,7 +335,7 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
 
 
 def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
-    """The ITU name that Sionna derives from a BSDF: its `type` string, or its own name without the prefix `itu_`."""
+    """The ITU name that Sionna derives from a BSDF: the BSDF's `type` string, or its name without the prefix `itu_`."""
     has_itu_name = name.startswith(("itu_", "itu-"))
     declared = None if bsdf is None else bsdf.find("string[@name='type']")
     if (
@@ -361,7 +361,7 @@ def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
 
 
 def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
-    """The numbers in a BSDF that describe the slab and its surface, not the bulk medium."""
+    """The numbers in a BSDF that describe the slab and its surface, but not the bulk medium."""
     return {key: value for key, value in _floats(bsdf).items() if key not in _BULK_FIELDS}
 
 
@@ -380,7 +380,7 @@ def export_scene(
     copy_meshes: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene file with new constants and the same frame; the file refers to the original meshes or to copies.
+    """Write a scene file with new constants in the same frame; the file refers to the original meshes or to copies.
 
     Materials and objects are given names that Sionna RT accepts (`exported_names`). Sionna scene files support only the
     Lambertian scattering pattern; set other patterns after loading the scene.
@@ -445,7 +445,7 @@ def exported_names(names: Iterable[str]) -> dict[str, str]:
 
 
 def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
-    """Copy a mesh; meshes with the same name from different folders are numbered."""
+    """Copy a mesh; copies of meshes from different folders that have the same name are numbered."""
     stem, number = plain_name(mesh.stem), 1
     name = f"{stem}{mesh.suffix}"
     while copies.setdefault(name, mesh) != mesh:

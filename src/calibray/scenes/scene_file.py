@@ -57,7 +57,7 @@ _PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
     "string": ("filename",),
     "transform": ("to_world", "toWorld"),
 }
-"""Properties of shapes by element, as spelled in Mitsuba 3 and in earlier versions."""
+"""Names of shape properties, by type of element, as spelled in Mitsuba 3 and in earlier versions."""
 
 _FRAME_COMMENT: Final = "calibray frame "
 
@@ -88,7 +88,7 @@ def unique_names(names: Iterable[str], taken: Collection[str] = (), kind: str = 
 
 
 def scene_path(source: str) -> Path:
-    """Find the XML file of a scene, given its path, or `sionna:NAME` for a scene bundled with Sionna RT.
+    """Find the XML file of a scene, given the path or, for a scene bundled with Sionna RT, `sionna:NAME`.
 
     Raises:
         InputError: There is no such file or bundled scene, or Sionna RT is not installed.
@@ -168,7 +168,7 @@ def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
 
 
 class _ShallowTree(ElementTree.TreeBuilder):
-    """A tree builder that refuses deep nesting, which would overflow the stack in recursive code."""
+    """A tree builder that refuses deep nesting, because it would overflow the stack in recursive code."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -188,7 +188,7 @@ class _ShallowTree(ElementTree.TreeBuilder):
 def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     """Read the mesh of a shape without applying its transform, and refuse a shape that cannot be traced.
 
-    The result is None for a rectangle or a cube, which has no file.
+    The result is None for a rectangle or a cube, because these shapes have no file.
 
     Raises:
         InputError: The shape is not a triangle mesh or has a degenerate transform, or its mesh is missing or malformed.
@@ -292,7 +292,7 @@ def write_scene(
     """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object.
 
     A material whose `type` is an ITU-R P.2040 material has the permittivity and conductivity of that ITU material. The
-    frame is stored in a comment, which `read_frame` reads. With `overwrite`, files that Calibray did not write are
+    frame is stored in a comment, which `read_frame` reads. With `overwrite`, even files that Calibray did not write are
     replaced.
 
     Returns the path of the XML file.
@@ -347,7 +347,7 @@ def frame_comment(frame: Frame) -> str:
 
 
 def read_frame(source: str | Path) -> Frame | None:
-    """Read the geographic frame of a scene; None if its file states no frame.
+    """Read the geographic frame of a scene; None if the scene file states no frame.
 
     Raises:
         InputError: The scene does not exist, or its file states an invalid frame.

@@ -1,8 +1,8 @@
 """Shapes of a scene in the scene frame: double-precision transforms, sizes, and copies for the tracer.
 
-A ray tracer computes in single precision, whose spacing is about 0.1 mm at 1 km from the origin and 0.5 m at UTM
-northings. A scene far from the origin is therefore traced in a local frame. This module reads and moves the meshes of
-such a scene in double precision, and only then rounds their coordinates.
+A ray tracer computes in single precision, in which the spacing of numbers is about 0.1 mm at 1 km from the origin and
+0.5 m at UTM northings. A scene far from the origin is therefore traced in a local frame. This module reads and moves
+the meshes of such a scene in double precision, and only then rounds their coordinates.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FAR: Final = 1000.0
 """Coordinate beyond which a scene can be traced in a local frame [m].
 
 Up to this distance, single-precision rounding errors are at most 0.03 mm. When three scenes 100 m wide were moved by 1
-km, all paths were kept and path loss stayed within 0.001 dB. At 2 km, path loss changed by 0.0015 dB, and at 10 km,
+km, no path was lost, and path loss changed by at most 0.001 dB. At 2 km, path loss changed by 0.0015 dB, and at 10 km,
 paths were found twice.
 """
 
@@ -35,7 +35,8 @@ COARSE: Final = 1e-3
 0.005 dB."""
 
 TOO_COARSE: Final = 1e-2
-"""Spacing of stored coordinates above which a scene cannot be traced [m]: walls no longer meet, and paths are lost."""
+"""Spacing of stored coordinates above which a scene cannot be traced [m], because walls no longer meet and paths are
+lost."""
 
 _SQUARE: Final = Mesh(
     np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]])
@@ -196,15 +197,15 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame in which a scene is traced.
 
     For a scene far from the origin of its coordinates, the local origin is the scene's centre, rounded to metres. A
-    scene counts as far from the origin if its largest coordinate exceeds both `FAR` and the scene's extent. In this
-    case, the local frame gains at least one bit of precision. Otherwise the local origin is zero.
+    scene counts as far from the origin if its largest coordinate exceeds both `FAR` and the scene's extent. In such a
+    scene, the local frame gains at least one bit of precision. Otherwise the local origin is zero.
     """
     if not sizes:
         return np.zeros(3)
     low = np.min([size.low for size in sizes], axis=0)
     high = np.max([size.high for size in sizes], axis=0)
     furthest = max(float(np.abs(low).max()), float(np.abs(high).max()))
-    # If a scene is as wide as it is far from the origin, a local origin at most halves its coordinates.
+    # If the width of a scene equals its distance from the origin, a local origin at most halves the coordinates.
     if furthest <= max(FAR, float((high - low).max())):
         return np.zeros(3)
     return np.rint((low + high) / 2)
@@ -213,7 +214,7 @@ def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
 def write_local_shape(
     shape: ElementTree.Element, path: Path, origin: NDArray[np.float64], target: Path
 ) -> None:
-    """Replace the mesh of a shape with a copy in the local frame with origin `origin` [3], [m], written to `target`.
+    """Write a shape's mesh to `target`, in the local frame with origin `origin` [3], [m], and make the shape use it.
 
     Raises:
         InputError: The mesh cannot be read.

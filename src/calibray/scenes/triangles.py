@@ -24,10 +24,10 @@ STEEP: Final = 0.1
 """A face is a wall if the vertical component of its unit normal is at most this value [1]."""
 
 WITHOUT_GAPS: Final = 0.9
-"""A level object that covers more than this fraction of its bounding box [1] is a sheet, such as a floor."""
+"""A level object that covers more than this fraction of its bounding box [1] counts as a sheet, such as a floor."""
 
 BATCH: Final = 2_000_000
-"""Maximum number of line-triangle pairs in memory at once; each pair needs about 100 bytes."""
+"""Maximum number of line-triangle pairs that are in memory at the same time; each pair needs about 100 bytes."""
 
 _EDGE: Final = 1e-9
 """Distance in plan up to which points outside a triangle count as inside, relative to the triangle's size [1]."""
@@ -63,7 +63,7 @@ class Triangles:
         vertex: Positions [V, 3], [m].
         face: Vertex indices of each triangle [F, 3].
         material: Index of each triangle's material in `Scene.materials` [F].
-        ground: Whether each triangle belongs to a ground sheet, such as terrain, a floor or a ceiling [F].
+        ground: Mask [F] of the triangles that belong to a ground sheet, such as terrain, a floor or a ceiling.
         left_out: Names of the objects that could not be read.
     """
 
@@ -80,7 +80,7 @@ class Triangles:
 
     @property
     def normal(self) -> NDArray[np.float64]:
-        """Normals [F, 3], [m^2], whose lengths are the areas of the triangles."""
+        """Normal vectors [F, 3], [m^2], whose lengths are the areas of the triangles."""
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
 
@@ -120,9 +120,9 @@ def read_triangles(scene: Scene) -> Triangles:
 
 
 def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each triangle belongs to a level object that extends over most of the scene [F].
+    """Mask [F] of the triangles that belong to a level object which extends over most of the scene.
 
-    A mesh of all roofs is also level and wide, but has gaps and lies above the mean height of the walls.
+    A mesh that contains all roofs is also level and wide, but it has gaps and lies above the mean height of the walls.
     """
     ground = np.zeros(len(owner), dtype=bool)
     if not len(owner):
@@ -131,7 +131,7 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
     area, height = np.linalg.norm(normal, axis=1), corners[:, :, 2].mean(axis=1)
     level = np.abs(normal[:, 2]) > LEVEL * area
     steep = area * ~level
-    # Mean height of the walls: roofs over most of the scene are above it, and the ground is below it.
+    # Mean height of the walls, which lies below roofs that extend over most of the scene, and above the ground.
     walls = float(np.average(height, weights=steep)) if steep.any() else np.inf
     extent = np.ptp(triangles.vertex[:, :2], axis=0)
     for number in np.unique(owner):
@@ -146,7 +146,7 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
-    """Whether a mesh is a level sheet over most of a scene with the given extents to the east and north [2], [m].
+    """Whether a mesh is a level sheet over most of a scene; `extent` [2] is the extent of the scene in x and y [m].
 
     Unlike in `Triangles.ground`, every face must be level. The mesh must span 80 % of the scene in each direction and
     cover half of its area; its height does not matter.
@@ -196,7 +196,8 @@ def vertical_crossings(
 
     The points [n, 3], [m], must be sorted by x.
     """
-    # The lines are shifted by less than a micrometre, because a line through a common edge would cross both triangles.
+    # The lines are shifted by less than a micrometre, because a line through an edge would cross both adjacent
+    # triangles.
     x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     # As the points are sorted by x, the points within a triangle's width are contiguous.

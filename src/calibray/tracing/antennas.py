@@ -1,11 +1,12 @@
 """Antennas: their patterns, their directions on every link, and the Jones vectors of departing and arriving paths.
 
-Patterns and polarizations follow Sionna RT, in closed form and double precision. The field is polarized along one
-slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4/5); its amplitude is the square root of
-the gain.
+Patterns and polarizations follow Sionna RT, in closed form and double precision. In every direction of the antenna's
+frame, the field has the same slant angle (3GPP TR 38.901, eq. 7.3-4/5), and its amplitude is the square root of the
+gain.
 
-The geometry of paths does not depend on the antennas. Paths traced with isotropic vertical antennas store the frames of
-their first and last interactions, so the fields for any pattern and orientation follow without another trace.
+The geometry of paths does not depend on the antennas. Paths traced with isotropic, vertically polarized antennas store
+the frames of their first and last interactions. The fields for any pattern and orientation therefore follow without
+another trace.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ BEAMWIDTH: Final = np.radians(65)
 
 
 class Amplitude(Protocol):
-    """Square root of the gain as a function of zenith and azimuth in (-pi, pi] in the antenna's frame [rad].
+    """Square root of the gain as a function of zenith and azimuth [rad] in the antenna's frame; azimuth in (-pi, pi].
 
     `xp` is the array library: NumPy, or `jax.numpy` within a JAX function.
     """
@@ -75,8 +76,8 @@ class AntennaPattern:
     ) -> Any:
         """Amplitude of the field in a direction, with electrical downtilt and horizontal steering [rad].
 
-        For an array, both angles steer the beam through the phases of the elements. For a single antenna, the downtilt
-        shifts the pattern downwards. An array's amplitude has its phase reference at the array's centre and can be
+        For an array, the phases of the elements steer the beam by both angles. For a single antenna, the downtilt
+        shifts the pattern downwards. The phase reference of an array is its centre; the amplitude of an array can be
         negative.
         """
         if not self.antenna.is_array:
@@ -87,7 +88,7 @@ class AntennaPattern:
         )
 
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
-        """Jones vectors [P, ports, 2] in the wave's basis (theta, phi), for directions seen from the antenna [P, 3].
+        """Jones vectors [P, ports, 2] in the waves' basis (theta, phi), for directions [P, 3] as seen from the antenna.
 
         The waves depart in these directions or, if `arriving` is true, arrive from these directions.
         """
@@ -123,7 +124,7 @@ def hw_dipole(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 
 def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a base station's antenna element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
-    # Both cuts are 12 dB down at one beamwidth from the main direction, and at most 30 dB down; the gain is 8 dBi.
+    # In both cuts, the loss is 12 dB at one beamwidth from the main direction and at most 30 dB; the gain is 8 dBi.
     vertical_loss_db = xp.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
     horizontal_loss_db = xp.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
     return xp.power(10.0, (8 - xp.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
@@ -132,14 +133,15 @@ def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
 def array_factor(
     antenna: Antenna, zenith: Any, azimuth: Any, downtilt: Any = 0.0, steering: Any = 0.0, xp: Any = np
 ) -> Any:
-    """Field of a planar array of isotropic elements with equal amplitudes and the total power of one antenna.
+    """Field of a planar array of isotropic, equally excited elements with the total power of one antenna.
 
-    Its main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad]. `xp`
-    provides the cosine and the sine. Mutual coupling of the elements is neglected, as in Sionna RT and 3GPP TR 38.901,
-    section 7.3.
+    The array's main direction is `downtilt` below the horizon and `steering` from the x axis towards the y axis [rad].
+    `xp` provides the cosine and the sine. Mutual coupling between the elements is neglected, as in Sionna RT and 3GPP
+    TR 38.901, section 7.3.
     """
     horizontal, vertical = (2 * np.pi * distance for distance in antenna.spacing)
-    # Phase between neighbours: 2 pi d / lambda times the direction cosine along y or z relative to the main direction.
+    # Phase difference of neighbours: 2 pi d / lambda times the direction cosine along y or z minus its value in the
+    # main direction.
     of_columns = horizontal * (xp.sin(zenith) * xp.sin(azimuth) - xp.cos(downtilt) * xp.sin(steering))
     of_rows = vertical * (xp.cos(zenith) + xp.sin(downtilt))
     factors = [
@@ -151,7 +153,7 @@ def array_factor(
 
 
 def _sum_of_cosines(count: int, phase: Any, xp: Any) -> Any:
-    """Sum of cos((k - (n - 1) / 2) phase) over k = 0 .. n - 1: field of a row of antennas relative to its centre."""
+    """Sum of cos((k - (n - 1) / 2) phase) over k = 0 .. n - 1: field of a row of antennas, referred to its centre."""
     half = xp.cos(phase / 2)
     double = 2 * (2 * half * half - 1)
     # cos((m + 1) x) = 2 cos x cos(m x) - cos((m - 1) x), from m = 0, or from m = 1/2 if `count` is even.
@@ -172,7 +174,7 @@ _AMPLITUDES: Final[dict[str, Amplitude]] = {
 
 
 def rotation_matrix(orientation: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Rotation [3, 3] from an antenna's frame into the scene frame (3GPP TR 38.901, eq. 7.1-4)."""
+    """Rotation matrix [3, 3] from an antenna's frame to the scene frame (3GPP TR 38.901, eq. 7.1-4)."""
     (cos_z, cos_y, cos_x), (sin_z, sin_y, sin_x) = np.cos(orientation), np.sin(orientation)
     about_z = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
     about_y = np.array([[cos_y, 0, sin_y], [0, 1, 0], [-sin_y, 0, cos_y]])
@@ -196,30 +198,30 @@ EVERY: Final = "*"
 
 
 NEW: Final = "new transmitters"
-"""Name that represents all transmitters without measured links in a population."""
+"""Name that represents, in a population, all transmitters without measured links."""
 
 
 def concerned(names: NDArray[np.str_], label: str, own: Collection[str]) -> NDArray[np.bool_]:
-    """Mask of the transmitters that a parameter of `label` affects; those in `own` have separate parameters."""
+    """Mask of the transmitters that a parameter with this label affects; those in `own` have separate parameters."""
     if label == EVERY:
         return np.ones(len(names), dtype=bool)
     return ~np.isin(names, list(own)) if label == NEW else names == label
 
 
 def turns(name: str) -> bool:
-    """Whether a parameter is the error of an antenna's direction or gain, such as "tx:CELL.azimuth"."""
+    """Whether a parameter, such as "tx:CELL.azimuth", is the error of an antenna's direction or gain."""
     return name.startswith(POSE) and name.rpartition(".")[2] in FIELDS
 
 
 class Pose(NamedTuple):
-    """Directions of the antennas of P paths or L links.
+    """Pointing directions of the antennas of P paths or L links.
 
     Attributes:
         yaw: Rotation about z [rad], from the scene's x axis towards its y axis.
         downtilt: Mechanical downtilt [rad]: the antenna is tilted forward after its rotation by `yaw`.
         electrical_downtilt: Downward shift of the pattern in the antenna's own frame [rad].
-        steering: Azimuth to which the phases of an array steer its beam, in the antenna's own frame and from its x axis
-            towards its y axis [rad].
+        steering: Azimuth to which the phases of an array steer its beam [rad], measured in the antenna's own frame from
+            the x axis towards the y axis.
     """
 
     yaw: Any
@@ -233,7 +235,7 @@ class Mounting:
     """The antennas at one end of L links.
 
     Attributes:
-        antennas: The distinct antennas; each orientation is relative to the mount.
+        antennas: The distinct antennas; the orientation of each is relative to the mount.
         index: Index of the antenna of every link [L].
         pose: Directions of the antennas [L].
 
@@ -260,7 +262,7 @@ class Mounting:
 
 
 def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
-    """In the fields of paths, replace isotropic vertical antennas with the antennas mounted at "tx" or "rx".
+    """In the fields of paths, replace the isotropic antennas of the trace with the antennas mounted at "tx" or "rx".
 
     The fields at ends without a mounting are unchanged.
     """
@@ -268,17 +270,17 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
     for end, mounting in mountings.items():
         angles = paths.departure if end == "tx" else paths.arrival
         jones = stated_jones(mounting.of_paths(paths.link), angles)
-        # The stored field of an isotropic vertical antenna is the theta vector of the path.
+        # The stored field of an isotropic, vertically polarized antenna is the theta vector of the path.
         axis = getattr(paths, f"{end}_field").real[:, 0]
         fields[f"{end}_field"] = in_frame(jones, axis, arriving=end == "rx").astype(complex)
     return replace(paths, **fields)
 
 
 def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
-    """Theta vector of departing paths in the frame of their first interaction [P, 2], given the transmit antennas.
+    """Theta vectors [P, 2] of departing paths in the frames of their first interactions, given the transmit antennas.
 
-    A path that departs in a perfect null of its antenna has no defined theta vector. In this case, the result is 0, so
-    the path has no power with any antenna.
+    If a path departs in a perfect null of its antenna, its theta vector is undefined. The result is then 0, so the path
+    has no power with any antenna.
     """
     theta, phi = stated_jones(mounting.of_paths(paths.link), paths.departure)[:, 0].T
     field = paths.tx_field[:, 0].real
@@ -289,7 +291,7 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
 
 
 def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction: zenith and azimuth [P, 2], [rad]."""
+    """Jones vectors [P, ports, 2] of mounted antennas in directions given by zenith and azimuth [P, 2], [rad]."""
     jones = np.zeros((len(angles), mounting.antennas[0].ports, 2))
     for number, antenna in enumerate(mounting.antennas):
         chosen = mounting.index == number
@@ -325,10 +327,10 @@ def antenna_response(
 ) -> tuple[Any, Any, Any]:
     """Response of a mounted antenna: amplitude, and components (cos, sin) of its theta vector in the waves' basis.
 
-    Each result has the shape [P]; the basis is returned by `wave_basis`. There is one pose for each path; if `index`
-    [P] is given, it is the index of the pose of each path. `xp` is the array library: NumPy, or `jax.numpy` within a
-    JAX function that is differentiated with respect to the pose. The function `stored` prevents intermediate values
-    from being computed again at each use.
+    Each result has the shape [P]; `basis` is the result of `wave_basis`. Without `index`, `pose` has one pose for each
+    path; otherwise, `index` [P] is the index of each path's pose. `xp` is the array library: NumPy, or `jax.numpy`
+    within a JAX function that is differentiated with respect to the pose. The function `stored` is applied to
+    intermediate values, so that they are not computed again at each use.
     """
     cos_yaw, sin_yaw = xp.cos(pose.yaw), xp.sin(pose.yaw)
     cos_tilt, sin_tilt = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
@@ -366,7 +368,7 @@ def antenna_response(
 
 
 def of_ports(antenna: Antenna, amplitude: Any, cosine: Any, sine: Any, xp: Any = np) -> Any:
-    """Jones vectors [P, ports, 2] of an antenna's ports: the response of `antenna_response`, rotated by each slant."""
+    """Jones vectors [P, ports, 2] of an antenna's ports: the result of `antenna_response`, rotated by each slant."""
     ports = []
     for slant in SLANTS[antenna.polarization]:
         a, b = np.cos(slant), np.sin(slant)
@@ -377,8 +379,8 @@ def of_ports(antenna: Antenna, amplitude: Any, cosine: Any, sine: Any, xp: Any =
 def in_frame(jones: Any, axis: Any, arriving: bool, xp: Any = np) -> Any:
     """Jones vectors [P, ports, 2] in the frame of the interaction next to the antenna.
 
-    `axis` is the unit theta vector in that frame [P, 2]: the field of an isotropic vertical antenna. An arriving wave
-    travels opposite to the direction of arrival, so its phi axis is mirrored.
+    `axis` [P, 2] is the unit theta vector in this frame, which is the field of an isotropic, vertically polarized
+    antenna. An arriving wave travels opposite to the direction of arrival, so its phi axis is mirrored.
     """
     sign = -1.0 if arriving else 1.0
     phi = sign * xp.stack([-axis[:, 1], axis[:, 0]], axis=-1)

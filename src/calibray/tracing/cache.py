@@ -1,4 +1,4 @@
-"""Stored traces: links are traced only once with the same scene, antennas, settings and versions.
+"""Stored traces, so that links are traced only once with the same scene, antennas, settings and versions.
 
 Traces are stored in Calibray's cache folder (`support.cache_folder`). A damaged trace is removed, with a warning in the
 log. If several users share the folder, each user's runs read only traces written by that user or root.
@@ -44,7 +44,7 @@ def trace_digest(
 ) -> str:
     """Fingerprint (SHA-256, in hexadecimal) of all inputs that determine a trace.
 
-    The scene's materials are included, because they determine how rays continue.
+    The scene's materials are included, because they influence the choice of a ray's next interaction.
     """
     record = {
         "calibray": version("calibray"),
@@ -66,7 +66,7 @@ def trace_digest(
 
 
 def files_digest(scene: Scene, antennas: tuple[Antenna, Antenna]) -> str:
-    """Fingerprint of the files that a tracer reads when it loads a scene: meshes and gain tables of the antennas."""
+    """Fingerprint of the files that a tracer reads when it loads a scene: the meshes and the antennas' gain tables."""
     digest = hashlib.sha256(json.dumps([antenna.record() for antenna in antennas]).encode())
     for mesh in mesh_files(scene):
         digest.update(mesh.read_bytes())
@@ -116,7 +116,7 @@ def _is_trusted(status: os.stat_result) -> bool:
 
 
 def store_trace(digest: str, paths: Paths) -> None:
-    """Store a trace under its fingerprint; nothing is stored if the cache folder cannot be written to."""
+    """Store a trace under its fingerprint, unless the cache folder cannot be written to."""
     path = _path(digest)
     if path is not None:
         with suppress(OSError, InputError):

@@ -17,19 +17,20 @@ from calibray.paths import Paths
 from calibray.tracing.settings import RANGES, TraceSettings
 
 PathLoss = Callable[[Paths], NDArray[np.float64]]
-"""A function such as `calibray.path_loss`, which returns the path loss of every link of a path program [L], [dB]."""
+"""A function, such as `calibray.path_loss`, that returns the path loss [L], [dB], of every link of a path program."""
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """The changes between a trace and a trace with more rays.
+    """The differences between a trace and a second trace with more rays.
 
     Attributes:
         samples: Number of rays per transmitter in the trace that was checked.
-        change_db: Change of each link's path loss with more rays [L], [dB]. The change is 0 if neither trace has a
-            path, -inf if only the trace with more rays has a path, and +inf if only the checked trace has a path.
+        change_db: Change in each link's path loss from the checked trace to the trace with more rays [L], [dB]. The
+            change is 0 if neither trace has a path, -inf if only the trace with more rays has a path, and +inf if only
+            the checked trace has a path.
         paths_before: Number of paths of every link in the checked trace [L].
-        paths_after: Number of paths of every link with more rays [L].
+        paths_after: Number of paths of every link in the trace with more rays [L].
     """
 
     samples: int
@@ -39,21 +40,21 @@ class Convergence:
 
     @property
     def gained(self) -> NDArray[np.int64]:
-        """Indices of the links with more paths than in the checked trace [links]."""
+        """Indices [n] of the links that have more paths than in the checked trace."""
         return np.flatnonzero(self.paths_after > self.paths_before)
 
     @property
     def lost(self) -> NDArray[np.int64]:
-        """Indices of the links with fewer paths than in the checked trace [links]."""
+        """Indices [n] of the links that have fewer paths than in the checked trace."""
         return np.flatnonzero(self.paths_after < self.paths_before)
 
     @property
     def largest(self) -> NDArray[np.int64]:
-        """Indices of the links, ordered by the magnitude of their change, largest first [L]."""
+        """Indices [L] of the links, ordered by the magnitude of their change, largest first."""
         return np.argsort(-np.abs(self.change_db), kind="stable")
 
     def quantile(self, share: float) -> float:
-        """Quantile of the magnitude of the change over the links [dB]; a `share` of 0.5 gives the median.
+        """Quantile over the links of the magnitude of the change [dB]; a `share` of 0.5 gives the median.
 
         The quantile is +inf if too many links have a path in only one trace.
         """
@@ -115,7 +116,7 @@ def check(
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:
-    """Join the changes of links that were traced in parts; each part states the indices of its links."""
+    """Join the changes of links that were traced in parts; each part includes the indices of its links."""
     count = sum(len(links) for links, _ in parts)
     change = np.empty(count)
     before, after = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)

@@ -4,10 +4,10 @@ Between grid points, the gain is interpolated bilinearly in decibels, including 
 decibels, main lobes are nearly parabolic (as in 3GPP TR 38.901, Table 7.3-1), so the error is smallest where the
 antenna radiates most. Nulls that are narrower than the grid spacing become shallower.
 
-Planning tools export a horizontal and a vertical cut in MSI Planet's text format (`TwoCuts`). Attenuations are relative
-to the gain in the header. Horizontal angles are measured clockwise from the main direction, as seen from above.
-Vertical angles are measured downwards from the horizon in front of the antenna, through the nadir to the back of the
-antenna.
+Planning tools export a horizontal and a vertical cut in the text format of MSI Planet (`TwoCuts`). Attenuations are
+relative to the gain in the file's header. Horizontal angles are measured clockwise from the main direction, as seen
+from above. Vertical angles are measured downwards from the horizon in front of the antenna, through the nadir to the
+back of the antenna.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class TwoCuts:
 
     Attributes:
         gain_dbi: Reference gain of the attenuations [dBi].
-        horizontal_db: Attenuation at whole degrees, clockwise from the main direction [360], [dB].
-        vertical_db: Attenuation at whole degrees, downwards from the horizon in front of the antenna [360], [dB].
+        horizontal_db: Attenuation [360], [dB], at whole degrees, clockwise from the main direction.
+        vertical_db: Attenuation [360], [dB], at whole degrees, downwards from the horizon in front of the antenna.
     """
 
     gain_dbi: float
@@ -50,13 +50,13 @@ class TwoCuts:
 
     @property
     def downtilt_deg(self) -> float:
-        """Angle of the main lobe below the horizon [deg]: mean of the angles in front with minimum attenuation."""
+        """Angle of the main lobe below the horizon [deg]: mean of the forward angles with minimum attenuation."""
         angle = (np.arange(360) + 180) % 360 - 180
         front = np.abs(angle) < 90
         return float(angle[front & (self.vertical_db == self.vertical_db[front].min())].mean())
 
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
-        """Gain in any direction of the antenna's frame [...], [dBi]; azimuths are counter-clockwise from the x axis.
+        """Gain [...], [dBi], in any direction of the antenna's frame; azimuths are counter-clockwise from the x axis.
 
         Between the cuts, the gain is interpolated by horizontal projection, which preserves both cuts exactly (Gil et
         al., "A 3D interpolation method for base-station-antenna radiation patterns", IEEE Antennas and Propagation
@@ -65,8 +65,8 @@ class TwoCuts:
         azimuth = (np.asarray(azimuth_deg, dtype=float) + 180.0) % 360.0 - 180.0
         down = -np.asarray(elevation_deg, dtype=float)
         horizontal, back = self._at(self.horizontal_db, -azimuth), np.abs(azimuth) / 180.0
-        # Both cuts contain the attenuation in front and at the back; the differences below avoid counting this
-        # attenuation twice.
+        # Both cuts contain the attenuation in front of the antenna and behind it; the differences below avoid counting
+        # this attenuation twice.
         front_db = self._at(self.vertical_db, down) - self.horizontal_db[0]
         back_db = self._at(self.vertical_db, 180.0 - down) - self.horizontal_db[180]
         return self.gain_dbi - (horizontal + (1 - back) * front_db + back * back_db)
@@ -156,7 +156,7 @@ def _cut(path: str | Path, first: int, lines: list[str], count: int, key: str) -
             )
         angle, attenuation = (float(word.replace(",", ".")) for word in words[:2])
         pairs[index] = _cut_in_range(place, "angle", angle), _cut_in_range(place, "attenuation", attenuation)
-    # A direction may be stated at both ends of a full turn; the first value is used.
+    # The file may state a direction at both ends of a full turn; the first value is used.
     angle, order = np.unique(np.round(pairs[:, 0] % 360.0, 6), return_index=True)
     largest = float(np.diff([*angle, angle[0] + 360.0]).max())
     if largest > LARGEST_STEP_DEG:
@@ -182,7 +182,7 @@ def _cut_in_range(place: str, name: str, value: float) -> float:
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
 LARGEST_EFFICIENCY: Final = 1.5
-"""Maximum ratio of radiated to accepted power at which the values are accepted as absolute gains [1]."""
+"""Maximum ratio of radiated to accepted power up to which values are accepted as absolute gains [1]."""
 SEAM_TOLERANCE_DB: Final = 0.1
 """Maximum difference between the gains at the first azimuth and at the same direction a full turn later [dB]."""
 _STEP_TOLERANCE: Final = 0.01
@@ -214,7 +214,7 @@ class GainTable:
 
     @property
     def efficiency(self) -> float:
-        """Ratio of radiated to accepted power [1]: the mean gain over the sphere; 1 for a lossless antenna."""
+        """Ratio of radiated to accepted power [1], which is the mean gain over the sphere; 1 for a lossless antenna."""
         step = np.radians(self.steps_deg[0])
         elevation = np.radians(np.linspace(-90, 90, len(self.gain_dbi)))
         # Integrals of cos(elevation) times the hat functions of linear interpolation, so that a gain of 0 dBi gives 1.
@@ -233,7 +233,7 @@ class GainTable:
         row = (xp.asarray(elevation_deg, dtype=float) + 90) / elevation_step
         column = ((xp.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / azimuth_step) % columns
         i = xp.clip(row.astype(int), 0, rows - 2)
-        # For tiny negative numbers, the remainder rounds to `columns`, the end of the last interval.
+        # For negative numbers very close to 0, the remainder rounds to `columns`, the end of the last interval.
         j = xp.minimum(column.astype(int), columns - 1)
         next_j = (j + 1) % columns
         u, v = row - i, column - j
@@ -352,7 +352,7 @@ def _axis(
 
 
 def _refuse_repeats(table: SourceTable, cell: NDArray[np.int64]) -> None:
-    """Raise an error if two rows [rows] have the same grid cell."""
+    """Raise an error if two rows have the same grid cell; `cell` [rows] is the cell of each row."""
     order = np.argsort(cell, kind="stable")
     repeats = np.flatnonzero(np.diff(cell[order]) == 0)
     if len(repeats):

@@ -2,7 +2,7 @@
 
 Without CUDA, Dr.Jit loads the newest libLLVM that it finds, and an incompatible version aborts the whole process. The
 choice is therefore made here, before Dr.Jit is imported. Every library is opened in a separate process, and
-`DRJIT_LIBLLVM_PATH` is set to the best library.
+`DRJIT_LIBLLVM_PATH` is set to the path of the best one.
 
 `python -m calibray.tracing.llvm` prints the Mitsuba variant and the library that the ray tracer will use. If no library
 is usable, the command prints installation instructions and exits with status 2.
@@ -32,7 +32,7 @@ has compiled `llvm.minimum` for x86 since version 17 (reviews.llvm.org D145634 a
 """
 
 TESTED_MAJORS = frozenset({19, 22})
-"""Major versions with which Sionna RT 2.2 was tested; other versions are accepted with a note."""
+"""Major versions with which Sionna RT 2.2 was tested; other supported versions are accepted with a note."""
 
 PROBE_TIMEOUT = 30.0
 """Time limit for opening one library [s]."""
@@ -76,7 +76,7 @@ if driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0:
 
 @dataclass(frozen=True)
 class Llvm:
-    """One libLLVM on this machine.
+    """A libLLVM library on this machine.
 
     Attributes:
         path: The file, or a bare name that the dynamic loader resolves.
@@ -161,7 +161,7 @@ def select() -> Llvm:
     """Set Dr.Jit's libLLVM and return it; call this function before Dr.Jit is imported.
 
     A library named by `DRJIT_LIBLLVM_PATH` is either used or refused, never ignored. If the variable is not set, the
-    best installed library is chosen, and the variable is set to it for this process and its children.
+    best installed library is chosen, and the variable is set to its path for this process and its children.
 
     Raises:
         InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names a library that is missing or unusable, Dr.Jit has
@@ -259,7 +259,7 @@ def _refuse_loaded() -> None:
 
 
 def _loader_cache() -> list[Path]:
-    """Files in the dynamic loader's cache that might be a libLLVM; empty if there is no such cache."""
+    """Files in the dynamic loader's cache that might be libLLVM libraries; empty if there is no such cache."""
     # On some distributions, ldconfig is not on the PATH of ordinary users.
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin")
     if ldconfig is None:

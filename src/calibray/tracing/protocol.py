@@ -29,7 +29,7 @@ from calibray.tracing.trace_plan import TracePlan
 
 
 class Links(Protocol):
-    """An object with the positions of transmitters and receivers [L, 3], [m], such as `Measurements`."""
+    """An object, such as `Measurements`, with the positions [L, 3], [m], of transmitters and receivers."""
 
     @property
     def tx(self) -> NDArray[np.float64]: ...  # noqa: D102
@@ -82,11 +82,11 @@ class Tracer(Protocol):
         ...
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
-        """Copy the tracer with different settings; the loaded scene is shared."""
+        """Copy the tracer, with different settings; the copy shares the loaded scene."""
         ...
 
     def plan(self, links: Links) -> TracePlan:
-        """Plan the launches of a trace, with an estimate of the memory that they need.
+        """Plan the launches of a trace, and estimate the memory that they need.
 
         Raises:
             InputError: There is no link, a position is not finite, or the ends of a link coincide.
@@ -96,7 +96,7 @@ class Tracer(Protocol):
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        """Find the paths of every link; `materials` override, by material name, the constants of the scene.
+        """Find the paths of every link; `materials` gives, by name, constants that replace those of the scene.
 
         `progress` is called with ("tracing", receivers traced, number of receivers).
 
@@ -110,8 +110,8 @@ class Tracer(Protocol):
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with the tracer's own field computation.
 
-        A tracer without its own field computation can replay the paths with `calibray.path_gains`. `materials`
-        override, by material name, the constants of the scene.
+        A tracer without its own field computation can replay the paths with `calibray.path_gains`. `materials` gives,
+        by name, constants that replace those of the scene.
 
         Raises:
             InputError: The links or materials are invalid, as described in `trace`.
@@ -120,7 +120,7 @@ class Tracer(Protocol):
         ...
 
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n]."""
+        """Whether each point [n, 3], [m], lies inside a closed body of the scene, for example a building; shape [n]."""
         ...
 
 
@@ -158,10 +158,10 @@ def compile_paths(
     materials: Mapping[str, Material],
     antennas: tuple[AntennaPattern, AntennaPattern],
 ) -> Paths:
-    """Compile the paths that a tracer found, in any order, into a path program.
+    """Compile the paths that a tracer found, which can be in any order, into a path program.
 
-    The order of `materials` defines the material indices in `chains`. `link` [P] is the link of every path, and `ends`
-    contains the positions of all links. The paths of the program are ordered by link; within a link, they keep the
+    Material indices in `chains` refer to the order of `materials`. `link` [P] is the link of every path, and `ends`
+    contains the positions of all links. The paths of the program are ordered by link; within a link, paths keep the
     given order.
     """
     geometry = compile_chains(chains)
@@ -179,7 +179,8 @@ def compile_paths(
         # The wave travels along `arrival`; seen from the receiver, it comes from the opposite direction.
         arrival=zenith_azimuth(-arrival),
         tx_field=rotate_jones(tx_pattern.jones_vectors(departure), geometry.departure_rotation),
-        # The inverse rotation transforms the receive pattern from the basis of arrival into the last frame.
+        # The inverse rotation transforms the receive pattern from the basis of the arriving wave into the frame of the
+        # last interaction.
         rx_field=rotate_jones(
             rx_pattern.jones_vectors(-arrival, arriving=True), geometry.arrival_rotation * [1, -1]
         ),
@@ -247,7 +248,7 @@ class EnclosedAntennas:
 
     @property
     def ends(self) -> tuple[tuple[str, tuple[int, ...], tuple[int, ...]], ...]:
-        """Name of each end of the links, rows with its antenna inside a body, and rows with it below the ground."""
+        """Name of each end of the links, rows with this antenna inside a body, and rows with it below the ground."""
         return ("transmitter", self.tx, self.tx_below), ("receiver", self.rx, self.rx_below)
 
     @classmethod
@@ -261,7 +262,7 @@ class EnclosedAntennas:
     ) -> EnclosedAntennas:
         """Collect the rows of the source file, given the row of each link and the masks of enclosed antennas [L].
 
-        Antennas that are also in a mask of antennas below the ground [L] are listed only as below the ground.
+        Antennas that are also in `tx_below` or `rx_below` [L] are listed only as below the ground.
         """
         under = [np.zeros(len(row), dtype=bool) if mask is None else mask for mask in (tx_below, rx_below)]
         tx, rx = tx & ~under[0], rx & ~under[1]

@@ -21,7 +21,7 @@ LARGEST_SPACING: Final = 10.0
 AUTO: Final = "auto"
 """Value of `samples` that lets the tracer choose the number of rays."""
 RAYS_PER_ROUND: Final = 250_000
-"""Number of rays per launch if rays are added in rounds."""
+"""Number of rays per launch for traces in which rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
 """Allowed ranges of settings; no machine can trace more rays or interactions, and Sionna RT's seeds have 32 bits."""
@@ -38,7 +38,8 @@ class TraceSettings:
         refraction: Follow transmission through surfaces.
         diffraction: Follow first-order diffraction at wedges.
         edge_diffraction: Also follow diffraction at free edges.
-        diffraction_lit_region: Keep diffracted paths to receivers in the lit region as well as in the shadow region.
+        diffraction_lit_region: Keep diffracted paths to receivers in the lit region as well as those in the shadow
+            region.
         diffuse_reflection: Follow diffuse reflections.
         samples: Rays per transmitter, 1 to 10^12. With "auto", rays are added in rounds until path loss converges;
             "auto" cannot be combined with diffuse reflection.
@@ -101,11 +102,11 @@ class Antenna:
 
     Attributes:
         pattern: "iso", "dipole", "hw_dipole" or "tr38901", or a gain file (see `read_gain_table`).
-        polarization: "V", "H", or dual "VH" or "cross". The field has this polarization in every direction of the
-            antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
+        polarization: "V", "H", or dual "VH" or "cross". In every direction of the antenna's frame, the field has this
+            polarization (3GPP TR 38.901, eq. 7.3-4/5) and the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
-        rows: Number of rows of a planar array of these antennas along its z axis; one signal feeds all antennas.
-        columns: Number of columns of the array along its y axis.
+        rows: Number of rows, along the z axis, of a planar array of these antennas; one signal feeds all antennas.
+        columns: Number of columns of the array, along its y axis.
         spacing: Horizontal and vertical spacing of the antennas of the array [wavelengths].
 
     Raises:

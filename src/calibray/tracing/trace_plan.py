@@ -2,10 +2,10 @@
 
 A launch sends rays from one transmitter and searches for paths to several receivers, or vice versa
 (`starts_at_receivers`). Below, *transmitter* means the end that sends the rays. The tracer stores data for every
-combination of ray, interaction and receiver, called a *lane*. The receivers of a transmitter are therefore split over
-launches; if one receiver needs too many lanes, the rays are split as well. Sionna's rays form a lattice of directions
-that does not depend on the seed. Each launch uses a share of the lattice, so all launches together send the same rays
-as a single launch would.
+combination of ray, interaction and receiver, called a *lane*. The receivers of a transmitter are therefore divided
+among launches; if one receiver needs too many lanes, the rays are divided as well. Sionna's rays form a lattice of
+directions that does not depend on the seed. Each launch uses a share of the lattice, so all launches together send the
+same rays as a single launch would.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LANES_PER_SECOND: Final = 3e7
 ADAPTIVE_SECONDS: Final = 3.0
 """Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
 SMALL_LAUNCH: Final = 5_000_000
-"""Maximum number of lanes of a small launch, which finds a few thousand candidate paths and takes at most 0.4 s."""
+"""Maximum number of lanes of a small launch; such a launch finds a few thousand candidate paths in at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
 """Side length of the grid cells for comparing interaction points [m]; points of different paths are rarely this
 close."""
@@ -43,7 +43,7 @@ close."""
 
 @dataclass(frozen=True)
 class Launch:
-    """Rays from one transmitter, and the receivers to which the tracer searches for paths.
+    """Rays from one transmitter, and the receivers for which the tracer searches for paths.
 
     Attributes:
         source: Position of the transmitter [3], [m].
@@ -63,10 +63,10 @@ class Launch:
 
 
 class Launches(Sequence[Launch]):
-    """The launches of a trace, each made on request, because 10^12 rays need too many launches to be stored.
+    """The launches of a trace, each created on request, because 10^12 rays would need too many launches to store.
 
     Args:
-        receivers: Transmitter [3], [m], and links [n] of each set of receivers that are traced together.
+        receivers: Transmitter [3], [m], and links [n] of each set of receivers that is traced together.
         settings: The tracer's settings.
         shares: Number of launches among which the rays to each set of receivers are divided.
     """
@@ -105,7 +105,7 @@ class TracePlan:
         launches: The launches; launches to the same receivers are consecutive.
         lanes: Rays x interactions x receivers of the largest launch.
         buffer: Size of the buffer for the paths of a launch [bytes].
-        adaptive: Whether each launch is the first of several, because rays are added until path loss converges.
+        adaptive: Whether each launch is followed by further launches until path loss converges.
     """
 
     launches: Sequence[Launch]
@@ -115,7 +115,7 @@ class TracePlan:
 
     @property
     def memory(self) -> int:
-        """Estimated memory that the trace needs, excluding the paths that it finds [bytes]."""
+        """Estimated memory [bytes] that the trace needs, excluding the paths that it finds."""
         return self.lanes * LANE_BYTES + self.buffer
 
     @property
@@ -144,9 +144,10 @@ class TracePlan:
 def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
     """Whether the receivers send the rays, which is the case if there are fewer receivers than transmitters.
 
-    A path is the same in both directions, so it can be reversed after it has been found. Diffuse reflection is not
-    reversible: the scattered direction, and the probability with which the tracer chose it, belong to one direction of
-    travel. Traces with diffuse reflection therefore start at the transmitters.
+    A deterministic path is the same in both directions, so it can be reversed after it has been found. Diffuse
+    reflection is not reversible: the scattered direction, and the probability with which the tracer chose that
+    direction, are valid for only one direction of travel. Traces with diffuse reflection therefore start at the
+    transmitters.
     """
     return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
 
@@ -154,11 +155,12 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
     """Split a trace into launches; `source` contains the position from which the rays of each link start [L, 3], [m].
 
-    A launch can have up to `lanes` rays x interactions x receivers; its buffer initially has room for `buffer` paths.
+    The product of rays, interactions and receivers in a launch is at most `lanes`; the buffer of a launch initially has
+    room for `buffer` paths.
     """
     depth = max(settings.max_depth, 1)
     rays, adaptive = settings.rays, settings.adaptive
-    # Adaptive rays are independent of the receivers: one search per source serves all receivers.
+    # In an adaptive search, rays are independent of the receivers, so one search per source serves all receivers.
     receivers_together = len(source) if adaptive else max(1, lanes // (rays * depth))
     shares = 1
     if settings.max_depth and not adaptive:
@@ -178,7 +180,7 @@ def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int,
 
 
 def launch_seed(seed: int, number: int) -> int:
-    """Seed of launch `number` among the launches to the same receivers; the first launch has the seed of the trace."""
+    """Seed of launch `number` to the same receivers; the first launch has the seed of the trace."""
     return seed if number == 0 else int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
@@ -201,7 +203,7 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
 def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
     """Repeat the last receiver [n, 3] so that only a few distinct receiver counts occur across launches.
 
-    The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is increased to a power
+    The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is rounded up to a power
     of two, or to a multiple of the largest power of two for which a launch is small.
 
     Example:
@@ -222,11 +224,11 @@ def find_repeats(
     vertex: NDArray[np.float64],
     is_sample: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Find the paths that an earlier launch to the same receivers has already found [P].
+    """Mask [P] of the paths that an earlier launch to the same receivers has already found.
 
     A deterministic path is the same for any ray that finds it: it interacts with the same objects at the same points.
-    Paths with a diffuse reflection are random samples and never count as repeats. Launch indices are ascending [P];
-    kinds of interaction are 0 after the last interaction [P, D]; interaction points are [P, D, 3], [m].
+    Paths with a diffuse reflection are random samples and never count as repeats. `launch` [P] is in ascending order.
+    `kind` [P, D] is 0 after the last interaction, and `vertex` [P, D, 3] contains the interaction points [m].
     """
     repeats = np.zeros(len(link), dtype=bool)
     rows = np.flatnonzero(~is_sample)

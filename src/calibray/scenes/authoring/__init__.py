@@ -1,6 +1,6 @@
 """Makes scenes from OpenStreetMap extracts, vector files, height models and floor plans.
 
-Each name is imported on first use, because different kinds of source need different libraries.
+Each name is imported on first use, because each type of source needs different libraries.
 """
 
 from typing import TYPE_CHECKING

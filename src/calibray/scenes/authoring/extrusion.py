@@ -1,14 +1,14 @@
 """Extrusion of buildings into walls, windows, roofs and undersides.
 
-The ground is divided into adjacent cells. Each cell lists the buildings that cover it and the heights of their bottoms
-and tops. At heights where buildings overlap, the taller building is used. If the map contains the parts of a building,
-these parts replace the outline of the building. Adjacent cells have the same corners along their common border, so
-walls and roofs that meet share their vertices.
+The ground is divided into adjacent cells. Each cell lists the buildings that cover it, with the heights of their
+bottoms and tops. At heights where buildings overlap, the taller building is used. If the map contains parts of a
+building, these parts replace the outline of the whole building. Adjacent cells have the same corners along their common
+border, so walls and roofs that meet share their vertices.
 
-A border has a wall at every height at which there is a building on only one side of the border. Between buildings of
+A border has a wall at each height at which exactly one side of the border is inside a building. Between buildings of
 different heights, the wall begins at the lower roof. Between buildings of equal height, there is no wall. All walls
-that meet at an end of a border use the same column of corners, so the surface is closed and its wedges are connected.
-Coordinates are whole millimetres, so corners are either identical or clearly different.
+that meet at an end of a border share one vertical column of corners, so the surface is closed and its wedges are
+connected. Coordinates are whole millimetres, so corners are either identical or clearly different.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from calibray.scenes.meshes import MILLIMETRE
 from calibray.support.lazy_imports import library
 
 Interval = tuple[float, float, int]
-"""Bottom [m] and top [m] of a building, and its index."""
+"""Bottom [m], top [m] and index of a building."""
 
 Length = TypeVar("Length", int, float)
 
 THINNEST: Final = GRID / 2
-"""Minimum thickness of an interval of heights [m]; thinner intervals are rounding artefacts and are dropped."""
+"""Minimum length of a height interval [m]; shorter intervals are rounding artefacts and are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """An area of ground (a shapely Polygon [m]) and the buildings on it, sorted by height and without overlap."""
+    """An area of ground (a shapely Polygon [m]) and its buildings' height intervals, sorted and without overlap."""
 
     polygon: Any
     stands: tuple[Interval, ...]
@@ -49,7 +49,7 @@ class Cell:
 def split_overlaps(
     footprints: Footprints, bottom: NDArray[np.float64], top: NDArray[np.float64]
 ) -> tuple[list[Cell], int]:
-    """Divide the area of buildings into cells, given the bottom and top of each building in the scene frame [n], [m].
+    """Divide the area that buildings cover into cells; `bottom` and `top` [n] are their heights in the scene frame [m].
 
     Returns the cells and the number of footprints that overlap another footprint.
     """
@@ -82,7 +82,7 @@ def split_overlaps(
 
 
 def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
-    """Divide the ground along the borders of polygons, and state which polygons cover each piece [n, pieces]."""
+    """Divide the ground along the borders of polygons; return the pieces and which polygons cover each [n, pieces]."""
     shapely = library("shapely", "scenes")
     borders = shapely.union_all(shapely.boundary(polygons), grid_size=GRID)
     pieces = shapely.get_parts(shapely.polygonize([borders]))
@@ -109,7 +109,7 @@ def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
 def subtract(
     interval: tuple[Length, Length, int], bottom: Length, top: Length
 ) -> list[tuple[Length, Length, int]]:
-    """Subtract a range of heights from the interval of a building, which leaves up to two intervals of this building.
+    """Subtract a range of heights from a building's interval; zero, one or two intervals of the building remain.
 
     Example:
         >>> subtract((0.0, 10.0, 7), 2.0, 4.0)
@@ -121,13 +121,13 @@ def subtract(
 
 
 WALL, WINDOW, ROOF, UNDERSIDE = range(4)
-"""Kinds of surfaces."""
+"""Types of surface."""
 
 Point = tuple[int, int]  # x, y [mm]
 Edge = tuple[Point, Point]
 Corner = tuple[int, int, int]  # x, y, z [mm]
 Stand = tuple[int, int, int]  # bottom [mm], top [mm], index of the building
-Strips = dict[Edge, list[tuple[Point, int]]]  # start and kind of each strip of an edge
+Strips = dict[Edge, list[tuple[Point, int]]]  # start and type of each strip of an edge
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Windows:
             raise InputError(f"module = {self.module!r}: must be a finite number of metres greater than 0")
 
     def divide(self, edge: Edge) -> list[tuple[Point, int]]:
-        """Divide a wall between two ends [mm] into strips, each with its start [mm] and its kind, `WALL` or `WINDOW`.
+        """Divide the wall between two points [mm] into strips; return the start [mm] and type of each strip.
 
         Example:
             >>> Windows(0.5, module=2.0).divide(((0, 0), (2000, 0)))
@@ -180,9 +180,9 @@ class Shell:
     """The surfaces of buildings as triangles.
 
     Attributes:
-        corners: Corners of each triangle, counter-clockwise when seen from outside [F, 3, 3], [mm].
-        owner: Index of the building to which each triangle belongs [F].
-        kind: `WALL`, `WINDOW`, `ROOF` or `UNDERSIDE` [F].
+        corners: Corners of each triangle [F, 3, 3], [mm], counter-clockwise when seen from outside.
+        owner: Building index of each triangle [F].
+        kind: Type of each triangle [F]: `WALL`, `WINDOW`, `ROOF` or `UNDERSIDE`.
     """
 
     corners: NDArray[np.int64]
@@ -193,9 +193,9 @@ class Shell:
 def extrude(
     cells: Sequence[Cell], windows: Windows | None = None, ground: NDArray[np.float64] | None = None
 ) -> Shell:
-    """Extrude buildings from their cells, with heights in the scene's frame.
+    """Extrude the buildings of cells; all heights are in the scene's frame.
 
-    Without `windows`, walls are not divided. `ground` is the height of the ground under each building [n], [m]. A body
+    Without `windows`, walls are not divided. `ground` [n] is the height of the ground under each building [m]. A body
     that stands on the ground is open at the bottom; any other body is closed. Without `ground`, all bodies are closed.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
@@ -234,7 +234,7 @@ def to_millimetres(length: float) -> int:
 
 
 def _rings(polygon: Any) -> list[list[Point]]:
-    """Corners of the rings of a polygon, with the interior to the left; the first corner is not repeated."""
+    """Corners of each ring of a polygon, ordered with the interior to the left; the first corner is not repeated."""
     oriented = library("shapely", "scenes").orient_polygons(polygon)
     rings = (oriented.exterior, *oriented.interiors)
     return [[(to_millimetres(x), to_millimetres(y)) for x, y in ring.coords[:-1]] for ring in rings]
@@ -245,7 +245,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
 
 
 def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """The buildings to the left of an edge, limited to the heights [mm] at which there is no building to the right."""
+    """The buildings to the left of an edge, limited to heights [mm] at which no building is to the right."""
     opposite = cell_of.get((edge[1], edge[0]))
     free = list(standing[cell_of[edge]])
     for low, high, _ in standing[opposite] if opposite is not None else ():
@@ -254,7 +254,7 @@ def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int]
 
 
 def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
-    """Strips of all edges that have a wall; both directions of an edge use the same corners."""
+    """The strips of each edge that has a wall; both directions of an edge have the same corners."""
     if windows is None or windows.share == 0:
         return {}
     strips: Strips = {}
@@ -271,7 +271,7 @@ def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
 
 
 def _columns(walls: dict[Edge, list[Stand]], strips: Strips) -> dict[Point, list[int]]:
-    """Heights [mm], in ascending order, at which the walls that meet at each corner begin or end."""
+    """For each corner, the heights [mm] at which the walls that meet there begin or end, in ascending order."""
     levels: dict[Point, set[int]] = defaultdict(set)
     for (start, end), stands in walls.items():
         heights = {height for low, high, _ in stands for height in (low, high)}
@@ -285,13 +285,13 @@ def wall_triangles(
 ) -> Iterator[tuple[Corner, Corner, Corner]]:
     """Divide a vertical rectangle into triangles, counter-clockwise for an observer to the right of its base line.
 
-    The base line runs from `left` to `right`, the x and y coordinates of the two sides. `left_levels` and
-    `right_levels` are the heights of the corners on these sides, in ascending order and including both ends. Yields the
-    corners of each triangle [mm].
+    The base line runs from `left` to `right`, which are the x and y coordinates of the two vertical sides.
+    `left_levels` and `right_levels` are the heights of the corners on these sides, in ascending order and including
+    both ends. Yields the corners of each triangle [mm].
     """
     left_column = [(*left, level) for level in left_levels if low <= level <= high]
     right_column = [(*right, level) for level in right_levels if low <= level <= high]
-    # Both sides are followed upwards: each step up one side forms a triangle with the current corner of the other side.
+    # Both sides are followed upwards: a step up one side forms a triangle with the current corner on the other side.
     i = j = 0
     while i < len(left_column) - 1 or j < len(right_column) - 1:
         left_done, right_done = i == len(left_column) - 1, j == len(right_column) - 1
@@ -339,10 +339,10 @@ def _with_strips(ring: Sequence[Point], strips: Strips) -> list[Point]:
 
 
 def triangulate(polygons: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangulate polygons [n], [mm], which may have holes, without adding corners.
+    """Triangulate polygons [n], [mm], without adding corners; polygons may have holes.
 
-    Returns the corners of the triangles, counter-clockwise [F, 3, 2], [mm], and the polygon of each triangle [F], in
-    ascending order.
+    Returns the corners [F, 3, 2], [mm], of the triangles, in counter-clockwise order, and the polygon index of each
+    triangle [F], in ascending order.
     """
     shapely = library("shapely", "scenes")
     parts, polygon = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)

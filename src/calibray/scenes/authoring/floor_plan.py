@@ -27,7 +27,7 @@ from calibray.support.output_files import exists
 _LOG: Final = logging.getLogger(__name__)
 
 OPENINGS: Final = frozenset({"door", "window"})
-"""Types of segments that replace the wall on which they are drawn."""
+"""Types of segment that replace the wall on which they are drawn."""
 
 THICKNESS: Final = (0.0005, 3.0)
 """Minimum and maximum thickness of a wall [m]; other values suggest that thickness and coordinates have different
@@ -38,7 +38,7 @@ USUAL_EXTENT: Final = (2.0, 300.0)
 300 m long."""
 
 VECTOR_SUFFIXES: Final = (".dxf", ".geojson", ".json", ".gpkg", ".shp", ".fgb", ".gdb")
-"""Extensions of vector files; any other file is read as CSV."""
+"""Extensions of vector files; a file with any other extension is read as CSV."""
 
 Lines = list[list[NDArray[np.float64]]]
 """The lines of each row of a plan; each line is an array of points [n, 2]."""
@@ -69,7 +69,7 @@ class Segment:
         bottom: Height of the bottom [m].
         top: Height of the top [m].
         thickness: Thickness [m]; None if unknown.
-        source: Name of the plan in messages.
+        source: Name of the plan, for messages.
     """
 
     start: tuple[float, float]
@@ -82,7 +82,7 @@ class Segment:
 
     @property
     def length(self) -> float:
-        """Length of the segment in plan [m]."""
+        """Horizontal length of the segment [m]."""
         return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
 
     @property
@@ -96,21 +96,22 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
     """Read a floor plan.
 
     Args:
-        path: A text table with the columns x0, y0, x1, y1 and type. Instead of the coordinates, a column wkt can
-            contain lines, polylines or outlines. The columns thickness, bottom and height are optional. Similar column
+        path: A text table with the columns x0, y0, x1, y1 and type. Instead of coordinates, the table can have a column
+            wkt with lines, polylines or outlines. The columns thickness, bottom and height are optional. Similar column
             names are recognized, and a unit of length in a column name, as in `width_cm`, applies to that column. The
             file can also be a DXF, GeoJSON or other vector file in the plan's coordinates. The attributes of a vector
-            file must have exactly these names, with or without a unit. If a DXF file has no attribute type, the name of
-            the layer is used as the type. Points and text in vector files are ignored.
-        height: Height of the top of each segment for which the plan states no height [m].
-        unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file, or
-            metres.
+            file must have exactly these names, with or without a unit. If a DXF file has no type attribute, the layer
+            name is used as the type. Points and text in vector files are ignored.
+        height: Height of the top of segments for which the plan states no height [m].
+        unit: The plan's unit of length [m], such as 0.001 for millimetres; if None, the unit stated in a DXF file or,
+            if no unit is stated, metres.
 
     Returns:
         The segments in file order; a polyline or outline becomes one segment per side.
 
     Raises:
-        InputError: The file or a column is missing or malformed, or a segment has no length, height or thickness.
+        InputError: The file or a column is missing or malformed, or a segment's length, height or thickness is not
+            greater than 0.
     """
     for name, value in (("height", height), ("unit", 1.0 if unit is None else unit)):
         if not 0 < value <= HIGHEST:
@@ -134,7 +135,7 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float | None = None) 
         bottom = 0.0 if np.isnan(bottom) else bottom
         extent = height - bottom if np.isnan(extent) else extent
         sides = [(tuple(a), tuple(b)) for part in parts for a, b in pairwise((part * unit).tolist())]
-        # A file may repeat the last point of an outline.
+        # An outline in a file may end with a repeated point.
         sides = [(a, b) for a, b in sides if np.hypot(b[0] - a[0], b[1] - a[1]) >= MILLIMETRE]
         if not sides or extent <= 0 or thickness <= 0:
             raise InputError(
@@ -223,7 +224,7 @@ def _read_vector(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
 def _with_known_names(
     path: Path, frame: pd.DataFrame, unit: float, others: Mapping[str, Sequence[str]]
 ) -> pd.DataFrame:
-    """Rename known columns to the names in this module, and convert lengths with a stated unit to the plan's unit."""
+    """Rename known columns to this module's names, and convert lengths with a stated unit to the plan's unit."""
     known = _known_names(map(str, frame), others)
     frame = frame.rename(columns=known)
     for column, name in known.items():
@@ -260,7 +261,7 @@ def _known_names(columns: Iterable[str], other_names: Mapping[str, Sequence[str]
 
 
 def _parts(geometry: Any) -> list[NDArray[np.float64]]:
-    """The points [n, 2] of each line of a geometry; outlines of areas are treated as lines."""
+    """The points [n, 2] of each line in a geometry; the outlines of areas count as lines."""
     shapely = library("shapely", "scenes")
     parts = shapely.get_parts(geometry)
     is_area = shapely.get_dimensions(parts) == 2

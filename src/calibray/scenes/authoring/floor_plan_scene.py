@@ -44,24 +44,24 @@ TYPES: Final = {
     "floor": SurfaceMaterial("floor", "concrete", 0.2),
     "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
 }
-"""Materials of the types whose names are not names of ITU-R P.2040 materials."""
+"""Materials of the types that are not named after an ITU-R P.2040 material."""
 
 LIDS: Final = ("floor", "ceiling")
 """Horizontal sheets over the whole area of a plan."""
 
 WALL_THICKNESS: Final = 0.12
-"""Thickness of a wall of an ITU material, used if the plan states no thickness [m]."""
+"""Thickness [m] of a wall whose type is an ITU material, used if the plan states no thickness."""
 
 STOREY: Final = 1.8
-"""Minimum height of a storey [m]; lower pieces of wall, such as parapets, do not count as storeys."""
+"""Minimum height of a storey [m]; lower walls, such as parapets, do not count as storeys."""
 
 ROUNDING: Final = 2.0
-"""Maximum distance [mm] by which rounding can move the corner of two crossing walls off the line of either wall."""
+"""Maximum distance [mm] by which rounding can move the common corner of two crossing walls off the line of a wall."""
 
-_REACH: Final = 0.03  # largest distance from a wall's face at which the end of another wall meets it [m]
+_REACH: Final = 0.03  # maximum distance between a wall's face and the end of a wall that meets it [m]
 
 Pieces = dict[tuple[Point, Point], list[tuple[int, int, str]]]
-"""Bottom [mm], top [mm] and material of the sheets over each piece of a line between two crossings."""
+"""Bottom [mm], top [mm] and material of the sheets above each section of a line between two crossings."""
 
 
 def make_plan_scene(
@@ -76,8 +76,8 @@ def make_plan_scene(
 
     Walls that cross or meet share corners. If a wall ends at the face of another wall, it is extended to the other
     wall's centre line. Between its own bottom and top, a door or window replaces the wall on which it is drawn; the
-    wall continues above and below. Any shorter line on a longer line is treated in the same way, for example a door
-    whose type has a different name.
+    wall continues above and below. Any shorter line drawn on a longer line, for example a door whose type has a
+    different name, is treated in the same way.
 
     Args:
         segments: Lines of the plan.
@@ -86,7 +86,7 @@ def make_plan_scene(
             material, such as `brick`, becomes the material `brick_wall`. If the plan states several thicknesses for one
             type, each thickness becomes a separate material.
         lids: Which of `LIDS` to make. A floor or ceiling covers the whole area that walls enclose; the floor is at the
-            lowest bottom of the walls, and the ceiling at their highest top.
+            height of the lowest wall bottom, and the ceiling at the height of the highest wall top.
         merge: Whether to merge two parallel lines into one wall (`merge_faces`).
         overwrite: Whether to replace files that Calibray did not write.
 
@@ -133,7 +133,7 @@ def make_plan_scene(
 def _materials(
     sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial], source: str
 ) -> list[SurfaceMaterial]:
-    """The material of each sheet; a type with several thicknesses has several materials."""
+    """The material of each sheet; a type with several thicknesses has one material for each thickness."""
     unknown = dict.fromkeys(sheet.kind for sheet in sheets if sheet.kind not in {*types, *ITU_NAMES})
     if unknown:
         listed = list(unknown)[:10]
@@ -174,7 +174,7 @@ def _separation(sheets: Sequence[Segment]) -> float | None:
 
 
 def _extend_to_walls(sheets: Sequence[Segment]) -> list[Segment]:
-    """Move the ends of sheets to the centre lines of the walls that they meet."""
+    """Move the ends of sheets along the sheets to the centre lines of the walls that they meet."""
     extended = list(sheets)
     for index, sheet in enumerate(extended):
         start, end = np.array(sheet.start), np.array(sheet.end)
@@ -198,7 +198,7 @@ def _extend(
         offset = end - other.start
         sine = outward[0] * along[1] - outward[1] * along[0]  # times the length of the other wall
         reach = (other.thickness or WALL_THICKNESS) / 2 + _REACH
-        # Nearly parallel walls are skipped, because their lines may cross far from the place where the walls meet.
+        # Nearly parallel walls are skipped, because their lines may cross far from the point where the walls meet.
         if abs(sine) < 0.1 * np.hypot(*along):
             continue
         step = (along[0] * offset[1] - along[1] * offset[0]) / sine
@@ -210,9 +210,9 @@ def _extend(
 
 
 def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """Cut lines at crossings.
+    """Divide lines at their crossings.
 
-    On each piece, doors and windows replace walls, and shorter lines replace longer lines.
+    On each section, doors and windows replace walls, and shorter lines replace longer lines.
     """
 
     def priority(number: int) -> tuple[bool, float, int]:
@@ -266,6 +266,6 @@ def _enclosed(pieces: Pieces) -> Any:
 
 
 def _lid(outline: Any, height: float) -> NDArray[np.int64]:
-    """A horizontal sheet over an area, counter-clockwise when seen from above [F, 3, 3], [mm]."""
+    """Triangles [F, 3, 3], [mm], of a horizontal sheet over an area, counter-clockwise when seen from above."""
     flat, _ = triangulate(library("shapely", "scenes").get_parts(outline))
     return np.concatenate([flat, np.full((len(flat), 3, 1), to_millimetres(height))], axis=2)

@@ -1,8 +1,8 @@
 """Footprints: the outlines of buildings in the scene's frame, with bottom and top heights, read from files.
 
-OpenStreetMap extracts are read with pyosmium, OpenStreetMap's own library. Pyosmium assembles multipolygon relations
-with holes by OpenStreetMap's rules, reads .osm and .pbf files, and returns all tags. GDAL's driver, in contrast,
-combines `building:levels` with other tags in one string. Nothing is downloaded.
+OpenStreetMap extracts are read with pyosmium, OpenStreetMap's own library. Pyosmium reads .osm and .pbf files,
+assembles multipolygon relations with holes according to OpenStreetMap's rules, and returns all tags. GDAL's driver, in
+contrast, combines `building:levels` with other tags in one string. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
 
 GRID: Final = 0.01
-"""Grid to which the corners of buildings are rounded [m]."""
+"""Spacing of the grid to which the corners of buildings are rounded [m]."""
 
 SMALLEST: Final = 1.0
-"""Smallest area of a building [m^2]."""
+"""Minimum area of a building [m^2]."""
 
 HIGHEST: Final = 1000.0
 """Maximum height of a building or building part [m]; the world's tallest building is 828 m high."""
@@ -67,11 +67,11 @@ class HeightRule:
                 raise InputError(f"{name} = {value!r}: must be greater than 0 and at most {HIGHEST:g} m")
 
     def heights(self, tags: Mapping[str, str]) -> tuple[float, float, HeightSource]:
-        """Derive a building's bottom [m], top [m] and the source of its top from OpenStreetMap tags.
+        """Derive the bottom [m] and top [m] of a building, and the source of the top, from OpenStreetMap tags.
 
-        `height` and `min_height` have priority, followed by `building:levels` and `building:min_level` times `storey`,
-        and then `default`. All heights are above the ground. Heights above `HIGHEST` are ignored, as is a stated top
-        that is not above the bottom. Roof shapes are ignored: the roof is flat at `height`.
+        `height` and `min_height` have priority, followed by `building:levels` and `building:min_level`, each multiplied
+        by `storey`, and finally `default`. All heights are above the ground. Heights above `HIGHEST` are ignored, as is
+        a stated top that is not above the bottom. Roof shapes are ignored: the roof is flat at `height`.
 
         Example:
             >>> HeightRule().heights({"building": "yes", "building:levels": "4"})
@@ -112,14 +112,14 @@ class Footprints:
     """Outlines and heights of buildings.
 
     Attributes:
-        polygon: Outline of each building, a shapely Polygon or MultiPolygon in the scene's frame [n], [m].
-        bottom: Height of the bottom of each building above the ground [n], [m].
-        top: Height of the top of each building above the ground [n], [m].
+        polygon: Outline of each building [n], a shapely Polygon or MultiPolygon in the scene's frame [m].
+        bottom: Height above the ground of the bottom of each building [n], [m].
+        top: Height above the ground of the top of each building [n], [m].
         name: Name of each building [n].
         height_from: Source of each top [n].
-        part: Whether each outline is a part of a building [n]; parts take precedence over the outline of the whole
+        part: Whether each outline [n] is a part of a building; parts take precedence over the outline of the whole
             building.
-        repairs: Number of buildings, by reason, that were changed, were left out or have no usable height.
+        repairs: Number of buildings that were changed, were left out or have no usable height, by reason.
     """
 
     polygon: NDArray[Any]
@@ -151,7 +151,7 @@ def clean_footprints(raw: Footprints) -> Footprints:
     """Prepare outlines for extrusion: round corners to a grid, remove self-intersections, and drop small outlines.
 
     Corners are rounded to multiples of `GRID`, outlines with an area below `SMALLEST` are left out, and repeated names
-    are made unique. Repairs are counted.
+    are made unique. The result states the number of repairs.
 
     Raises:
         InputError: A height is not a number or is above `HIGHEST`, or the buildings are farther apart than `WIDEST`.
@@ -212,7 +212,7 @@ def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
 
 
 def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
-    """Project outlines [n] from a coordinate reference system to the scene's frame [m]; their heights are ignored.
+    """Project outlines [n] from a coordinate reference system to the scene's frame [m]; z coordinates are dropped.
 
     Raises:
         InputError: A corner is outside the area of the frame's projection.
@@ -233,10 +233,10 @@ _SOURCES: Final[tuple[HeightSource, ...]] = ("default", "levels", "height")
 def read_openstreetmap(
     path: str | Path, frame: Frame | None = None, rule: HeightRule | None = None
 ) -> tuple[Footprints, Frame]:
-    """Read the buildings of an extract: closed ways and multipolygon relations tagged `building` or `building:part`.
+    """Read the buildings in an extract: closed ways and multipolygon relations tagged `building` or `building:part`.
 
     Returns the footprints and their frame, which by default is a local frame centred on the buildings. `rule` contains
-    the assumptions for heights that the map does not state.
+    the assumptions for buildings whose height the map does not state.
 
     Raises:
         InputError: The file does not exist, is not an extract or contains no building, or pyosmium is not installed.
@@ -271,7 +271,7 @@ def read_openstreetmap(
     frame = frame or _local_frame(degrees, WGS84)
     bottoms, tops, sources = zip(*(rule.heights(building) for building in tags), strict=True)
     incomplete = announced - len(outlines)
-    # Stated heights or numbers of storeys that cannot be used, such as "~25"; a less reliable source replaces them.
+    # Stated heights or numbers of storeys that cannot be used, such as "~25", so a less reliable source replaces them.
     unused = [
         building[key]
         for building, source in zip(tags, sources, strict=True)
@@ -300,9 +300,9 @@ class FootprintColumns:
     """Columns of a vector file other than the column of building heights.
 
     Attributes:
-        bottom: Column with the heights of the bottoms of buildings [m], or one height for all buildings.
+        bottom: Column with the bottom height of each building [m], or one height for all buildings.
         name: Column with the names of buildings; buildings without a name are numbered.
-        levels: Column with the numbers of storeys, for buildings without a height.
+        levels: Column with the number of storeys, for buildings without a height.
     """
 
     bottom: str | float = 0.0
@@ -323,9 +323,10 @@ def read_footprints(
     Args:
         path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its coordinate
             reference system.
-        height: Column with the heights of the buildings above the ground, in metres or the unit in its name
-            (`height_ft`), or one height for all [m]. Text that is both a number and the name of a column is interpreted
-            as the name. The height can be None if `columns` names a column of numbers of storeys.
+        height: Column with the height of each building above the ground, in metres or in the unit stated in the column
+            name (as in `height_ft`), or one height for all buildings [m]. Text that is both a number and the name of a
+            column is interpreted as the name. `height` can be None if `columns` names a column with the number of
+            storeys.
         columns: Additional columns.
         layer: Layer to read if the file has more than one layer.
         frame: The scene's frame; by default, a local frame centred on the footprints.
@@ -380,7 +381,7 @@ def _local_frame(outlines: NDArray[Any], crs: str) -> Frame:
 
 
 def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArray[Any]], str]:
-    """Read the polygons [n], the columns of their table, and the coordinate reference system."""
+    """Read the polygons [n], their attributes by column, and the coordinate reference system."""
     shapely = library("shapely", "scenes")
     features = read_features(path, layer)
     outlines = features.outline

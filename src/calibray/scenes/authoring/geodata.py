@@ -1,8 +1,8 @@
 """Read vector files and height models with a fixed list of drivers.
 
 GDAL has drivers that fetch URLs, open other files or run pipelines named in a file (VRT, WMS, WFS, GDALG). GDAL chooses
-the driver by the content of the file. This module opens only formats without references to other files. A file is
-recognized by its first bytes, and the sizes that it declares are checked before the data are read.
+the driver from the content of the file. This module opens only files in formats that cannot refer to other files. A
+file is recognized by its first bytes, and the sizes that it declares are checked before the data are read.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ _MAGIC: Final = (
 
 _LOG: Final = logging.getLogger(__name__)
 _DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
-"""Start of a DXF file; it must not contain `<` or `{`, which occur in the formats of other drivers."""
+"""Start of a DXF file, without `<` or `{`, which occur in formats that other drivers read."""
 
 _INSUNITS: Final = {1: 0.0254, 2: 0.3048, 4: 0.001, 5: 0.01, 6: 1.0, 14: 0.1}
-"""DXF units of length [m]: inches, feet, millimetres, centimetres, metres, decimetres."""
+"""Length of each DXF unit [m], by code: inch, foot, millimetre, centimetre, metre and decimetre."""
 
 _METRES: Final = {
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
@@ -68,7 +68,7 @@ _METRES: Final = {
     **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
     **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
 }
-"""Units of height [m] by name."""
+"""Length of each unit of height [m], by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Features:
 
     Attributes:
         outline: Geometries [n].
-        columns: Attributes by name, each [n].
+        columns: Values of each attribute [n], by name.
         crs: Coordinate reference system of the geometries; None if the file states no system.
     """
 
@@ -227,7 +227,7 @@ class HeightModel:
         path: The file.
         dataset: The raster, as opened by rasterio.
         crs: Horizontal coordinate reference system as WKT.
-        metres: Unit of the stored heights after scale and offset are applied [m].
+        metres: Unit of the heights [m], after scale and offset have been applied to the stored numbers.
     """
 
     path: Path
@@ -238,7 +238,7 @@ class HeightModel:
     def read(
         self, first: NDArray[np.integer], last: NDArray[np.integer], lowest: float = HEIGHTS[0]
     ) -> np.ma.MaskedArray:
-        """Read heights [rows, columns], [m], from the first to the last row and column, inclusive; gaps are masked.
+        """Read heights [rows, columns], [m], from the first to the last row and column, both included; gaps are masked.
 
         Raises:
             InputError: There are too many heights, the heights cannot be read, or a value is less than `lowest` [m] or

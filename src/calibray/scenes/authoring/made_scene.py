@@ -89,12 +89,12 @@ class SurfaceMaterial:
             )
 
     def constants(self) -> dict[str, float | str]:
-        """The constants as written in a scene file."""
+        """The constants in the form in which a scene file states them."""
         return {"type": self.itu, "thickness": self.thickness}
 
 
 def material_name(kind: str) -> str:
-    """Make a material name from a type of wall, which can contain any characters.
+    """Make a material name from the name of a wall type, which can contain any characters.
 
     Example:
         >>> material_name("tür 2"), material_name("brick"), material_name("2 x drywall")
@@ -132,7 +132,7 @@ class MadeScene:
         frame: Geographic frame of the scene; None if unknown.
         bounds: West, south, bottom, east, north and top [6], [m].
         triangles: Number of triangles by material.
-        counts: Number of objects that were used, repaired or left out, by kind.
+        counts: Number of objects that were used, repaired or left out, by category.
         guessed: Names of the buildings with an assumed height, grouped by the source of the assumption.
         walls: Sentences that state how the lines of a floor plan were used.
     """
@@ -220,17 +220,18 @@ def make_scene(
         footprints: The buildings.
         folder: Folder for `scene.xml`, `scene.json` and the meshes.
         frame: Geographic frame of the scene, which is stored in the files.
-        terrain: The ground; by default, it is level at z = 0 and extends `margin` beyond the buildings. With terrain,
-            the heights of a building and of its parts are measured from the lowest ground under its walls.
+        terrain: The ground; by default, the ground is level at z = 0 and extends `margin` beyond the buildings. With
+            terrain, the heights of a building and of its parts are measured from the lowest ground under the building's
+            walls.
         palette: The materials.
         windows: Division of walls into strips of wall and window; None for walls without windows.
         margin: Distance by which level ground extends beyond the buildings [m].
-        ground: Whether to make the ground; without ground, buildings are closed at the bottom.
+        ground: Whether the scene includes ground; without ground, buildings are closed at the bottom.
         per_building: Whether to make one mesh per building and material, named `BUILDING-MATERIAL`, instead of one mesh
             per material. With separate meshes, a study can assign separate materials to individual buildings. Tracing
             many meshes takes longer.
         overwrite: Whether to replace files that Calibray did not write.
-        trees: Trees. If `frame` is given, the trees within `margin` of the buildings are written to `TREES_FILE` next
+        trees: The trees. If `frame` is given, trees within `margin` of the buildings are written to `TREES_FILE` next
             to the scene.
 
     Raises:

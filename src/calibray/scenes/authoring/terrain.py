@@ -1,4 +1,4 @@
-"""Terrain: the ground as a sheet of triangles, level or from a height model."""
+"""Terrain: the ground as a sheet of triangles, either level or derived from a height model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_POINTS: Final = 4_000_000
 
 STEP: Final = 200.0
 """A cell is suspicious if its height differs from the heights of all neighbouring cells by at least this amount [m].
-The number -999 in feet, which marks gaps in some models, is a height of -304 m. Buildings and masts in surface models
+For example, some models mark gaps with -999 in feet, which is a height of -304 m. Buildings and masts in surface models
 are rarely taller than this amount."""
 
 _LOG: Final = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ class Terrain:
         x: Eastings of the grid, ascending [nx], [m].
         y: Northings of the grid, ascending [ny], [m].
         z: Heights [ny, nx], [m].
-        repairs: Number of heights that were filled in, by reason.
+        repairs: Number of missing heights that were filled in, by reason.
     """
 
     x: NDArray[np.float64]
@@ -145,19 +145,19 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
 def pixels(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, crs: str, affine: object
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Column and row of a raster at positions in the frame; cell centres have integer values."""
+    """Columns and rows in a raster of positions in the frame; the centres of cells have integer values."""
     east, north = transformer(frame.crs, crs).transform(x + frame.easting, y + frame.northing)
     inverse = ~affine  # type: ignore[operator]
     column = inverse.a * east + inverse.b * north + inverse.c
     row = inverse.d * east + inverse.e * north + inverse.f
-    # The affine transform is measured from the corner of the first cell, not from its centre.
+    # The affine transform counts columns and rows from the corner of the first cell, not from its centre.
     return column - 0.5, row - 0.5
 
 
 def _warn_of_steps(model: HeightModel, heights: np.ma.MaskedArray, first: NDArray[np.integer]) -> None:
-    """Warn if the lowest or highest cells [rows, columns], [m], differ from all their neighbours by `STEP` or more.
+    """Warn if the lowest or highest heights [rows, columns], [m], differ from all their neighbours by `STEP` or more.
 
-    Such cells are often gaps that the file does not declare. `first` is the row and column of the first cell.
+    Such heights are often gaps that the file does not declare. `first` is the row and column of the first cell.
     """
     known = ~np.ma.getmaskarray(heights)
     if not known.any():

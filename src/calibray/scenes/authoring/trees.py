@@ -32,21 +32,21 @@ KINDS: Final = {
 """Kinds of trees by OpenStreetMap tag."""
 
 HEIGHTS: Final = {"tree": 10.0, "tree row": 10.0, "wood": 15.0, "forest": 15.0}
-"""Assumed heights [m] of trees without a stated height. In the wood with the largest loss in ITU-R P.833, the mean
-height was 15 m."""
+"""Assumed heights [m] of trees without a stated height. In ITU-R P.833, the wood with the largest loss had a mean tree
+height of 15 m."""
 
 CROWN: Final = 6.0
 """Assumed diameter of a crown [m]."""
 
 CLEARANCE: Final = 2.5
-"""Height of the bottom of the crowns of single trees and tree rows [m], high enough for people to pass; woods extend to
-the ground."""
+"""Height [m] at which the crowns of single trees and tree rows begin, high enough for people to pass underneath; woods
+begin at the ground."""
 
 TALLEST: Final = 120.0
 """Maximum height of a tree [m]; the world's tallest tree is 116 m high."""
 
 WIDEST_CROWN: Final = 60.0
-"""Largest diameter of a crown [m]."""
+"""Maximum diameter of a crown [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +55,9 @@ class Trees:
 
     Attributes:
         outline: Shapely polygons in the scene's frame [n], [m].
-        kind: Kind of each polygon, one of the values of `KINDS` [n].
-        bottom: Height of the bottom of each prism above the ground [n], [m].
-        top: Height of the top of each prism above the ground [n], [m].
+        kind: Kind of each polygon [n], one of the values of `KINDS`.
+        bottom: Height above the ground of the bottom of each prism [n], [m].
+        top: Height above the ground of the top of each prism [n], [m].
         assumed: Whether each height is an assumption [n].
     """
 
@@ -158,7 +158,7 @@ def read_trees(path: str | Path, frame: Frame) -> Trees:
 
 
 def _stated(tags: Mapping[str, str], key: str, largest: float) -> float | None:
-    """The length in a tag [m]; None if it is not stated, cannot be parsed or is out of bounds."""
+    """The length stated in a tag [m]; None if it is missing, cannot be parsed or is out of bounds."""
     length = parse_length(tags.get(key))
     return length if length is not None and 0 < length <= largest else None
 
@@ -167,8 +167,8 @@ LEAST: Final = 2.0
 """Minimum height of vegetation that counts as trees [m], as in canopy models from laser scans."""
 
 STEP: Final = 1.0
-"""Step to which canopy heights are rounded [m], so adjacent cells of equal height form one polygon; canopy models have
-errors of metres."""
+"""Step to which canopy heights are rounded [m], so that adjacent cells of equal height form one polygon. The step is
+smaller than the errors of canopy models, which are several metres."""
 
 
 def read_canopy(
@@ -178,7 +178,7 @@ def read_canopy(
 
     Args:
         path: A GeoTIFF of heights above the ground, with the same requirements and limits as a height model
-            (`open_height_model`); gaps and cells with negative values have no trees.
+            (`open_height_model`); gaps and cells with negative values count as free of trees.
         frame: The scene's frame.
         bounds: West, south, east and north bounds in the frame [4], [m].
 
@@ -205,7 +205,7 @@ def read_canopy(
     classes = np.round(heights / STEP).astype(np.int32)
     a, b, c, d, e, f = (float(value) for value in tuple(affine)[:6])
     row, column = (int(value) for value in first)
-    # The transform of the part that was read has its origin at the first cell of this part.
+    # The origin of this transform is the first cell that was read.
     window = type(affine)(a, b, c + a * column + b * row, d, e, f + d * column + e * row)
     polygons = [
         (shapely.from_geojson(json.dumps(shape)), value * STEP)

@@ -1,10 +1,10 @@
 """Wall alignment: walls whose planes differ only because of rounding are moved into one plane.
 
-Coordinates are rounded to a centimetre in OpenStreetMap and to a millimetre in Calibray. The front of a row of houses,
-or a wall divided where another wall meets it, then consists of several planes that almost coincide. Sionna RT treats
-planes that are much less than 1 cm apart as different planes, so it finds the same reflection several times. Therefore,
-one straight line is fitted to collinear edges by least squares, and corners are moved onto the lines of their walls.
-Inputs are in whole millimetres, and outputs are in metres.
+Coordinates are rounded to a centimetre in OpenStreetMap and to a millimetre in Calibray. Because of this rounding, the
+front of a row of houses, or a wall divided where another wall meets it, consists of several planes that almost
+coincide. Sionna RT treats planes that are much less than 1 cm apart as different planes, so it finds the same
+reflection several times. Therefore, one straight line is fitted to collinear edges by least squares, and corners are
+moved onto the lines of their walls. Inputs are in whole millimetres, and outputs are in metres.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TURN: Final = 0.05
 """Sine of the maximum angle between two collinear walls; rounding can rotate short walls by this angle."""
 
 CROSSING: Final = 0.2
-"""Sine of the minimum angle at which the crossing of two lines defines a corner."""
+"""Sine of the minimum angle between two lines whose intersection defines a corner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Alignment:
 
 
 def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignment:
-    """Align collinear walls among vertical and level triangles [F, 3, 3], [mm].
+    """Align the collinear walls in a set of vertical and level triangles [F, 3, 3], [mm].
 
     Corners within `tolerance` [mm] of a straight line are moved onto this line, unless the move would reverse an edge
     or a level triangle.
@@ -58,7 +58,7 @@ def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignme
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     original = points.astype(float)
     area = _area(original[faces])
-    # A vertical triangle has no area in plan; its sides in plan are edges of walls.
+    # A vertical triangle has no area in plan, and its sides in plan are edges of walls.
     is_wall = np.repeat(area == 0, 3)
     edges = np.unique(sides[is_wall & (sides[:, 0] != sides[:, 1])], axis=0)
     moved = _move_onto_lines(original, edges, tolerance)
@@ -74,7 +74,7 @@ def _area(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def _move_onto_lines(
     points: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float
 ) -> NDArray[np.float64]:
-    """Move each point onto the line of the edges that end at it, or to the crossing of the two longest such lines."""
+    """Move each point onto the line of its edges, or to the intersection of the two longest lines that meet at it."""
     moved = points.copy()
     line = _lines(points[edges], edges, tolerance)
     if not (line >= 0).any():
@@ -89,11 +89,11 @@ def _move_onto_lines(
         step = along * ((points[point] - middle[first]) @ along)
         crossing = next((other for other in others if abs(_cross(along, direction[other])) > CROSSING), None)
         if crossing is not None:
-            # Crossing of the two lines, by Cramer's rule.
+            # Intersection of the two lines, by Cramer's rule.
             reach = _cross(middle[crossing] - middle[first], direction[crossing])
             step = along * reach / _cross(along, direction[crossing])
         target = middle[first] + step
-        # If the angle is small, the crossing can be far from the corner.
+        # If the angle is small, the intersection can be far from the corner.
         if np.hypot(*(target - points[point])) <= 2 * tolerance:
             moved[point] = target
     return moved
@@ -104,7 +104,7 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Index of the line of each edge; -1 for an edge that is not collinear with any other edge [E].
+    """Index [E] of the line to which each edge belongs; -1 if the edge is not collinear with any other edge.
 
     Edges that share a corner are first joined into runs; then, nearby runs are joined into lines.
     """
@@ -112,7 +112,7 @@ def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: f
         return np.zeros(0, dtype=np.int64)
     run = _group(segments, _parallel(segments, _touching(edges)), tolerance)
     single = run < 0
-    # Each remaining edge is a run of its own.
+    # Each remaining edge forms its own run.
     run[single] = run.max() + 1 + np.arange(single.sum())
     middle, direction, _ = _fit_lines(segments, run)
     ends = ((segments - middle[run][:, None]) @ direction[run][..., None])[..., 0]
@@ -130,7 +130,7 @@ def _lines(segments: NDArray[np.float64], edges: NDArray[np.int64], tolerance: f
 
 
 def _touching(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs of edges that share a corner, including each edge with itself [P, 2]."""
+    """Pairs [P, 2] of edges that share a corner; each edge is also paired with itself."""
     order = np.argsort(edges.reshape(-1), kind="stable")
     degree = np.bincount(edges.reshape(-1))
     first = np.cumsum(degree) - degree
@@ -141,7 +141,7 @@ def _touching(edges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The pairs of different segments that are nearly parallel, each pair once [P, 2]."""
+    """The pairs [P, 2] of different segments that are nearly parallel, each pair once."""
     direction = segments[:, 1] - segments[:, 0]
     direction /= np.hypot(*direction.T)[:, None]
     one, other = direction[pairs[:, 0]], direction[pairs[:, 1]]
@@ -151,11 +151,11 @@ def _parallel(segments: NDArray[np.float64], pairs: NDArray[np.int64]) -> NDArra
 
 
 def _group(segments: NDArray[np.float64], pairs: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-    """Index of the line that each segment shares with other segments; -1 if there is no such line [S]."""
+    """Index [S] of the line that each segment shares with other segments; -1 if there is no such line."""
     line = np.full(len(segments), -1)
     closeness, count = tolerance, 0
     # Short segments of an arc can form a chain that no line fits; these segments are grouped again with a smaller
-    # distance.
+    # tolerance.
     while len(pairs) and closeness > 1:
         pairs = pairs[_continues(segments, pairs, closeness)]
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(segments), len(segments)))
@@ -179,7 +179,7 @@ def _group(segments: NDArray[np.float64], pairs: NDArray[np.int64], tolerance: f
 def _continues(
     segments: NDArray[np.float64], pairs: NDArray[np.int64], closeness: float
 ) -> NDArray[np.bool_]:
-    """Whether the shorter segment of each pair lies on the line of the longer segment [P]."""
+    """Mask [P] of the pairs in which the shorter segment lies on the line of the longer segment."""
     direction = segments[:, 1] - segments[:, 0]
     length = np.hypot(*direction.T)
     direction /= length[:, None]
@@ -192,7 +192,7 @@ def _continues(
 def _across(
     segments: NDArray[np.float64], middle: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Signed distances of the ends of segments [n, 2, 2] from lines [n, 2]."""
+    """Signed distances [n, 2] of the ends of segments [n, 2, 2] from lines, given by points and directions [n, 2]."""
     offset = segments - middle[:, None]
     return offset[..., 0] * direction[:, None, 1] - offset[..., 1] * direction[:, None, 0]
 

@@ -21,13 +21,13 @@ THICKEST: Final = 0.6
 """Maximum thickness of a wall whose faces are merged [m]."""
 
 _PARALLEL: Final = np.cos(np.radians(2.0))
-_TOUCHING: Final = 0.02  # distance below which ends meet [m]
+_TOUCHING: Final = 0.02  # distance below which two ends count as meeting [m]
 _SAME: Final = ("kind", "bottom", "top", "thickness")  # attributes that sheets of one wall have in common
 
 
 @dataclass(frozen=True)
 class MergedPlan:
-    """The sheets of a plan, and a report on the use of its lines.
+    """The sheets of a plan, and a report that states how its lines were used.
 
     Attributes:
         sheets: One sheet for each wall, door and window.
@@ -48,12 +48,12 @@ def merge_faces(segments: Sequence[Segment]) -> MergedPlan:
     have a closer opposite face. The distance between the lines is at most `THICKEST`. If the thickness of the wall is
     given, the distance differs from the thickness by at most a fifth of the thickness or 2 cm, whichever is greater.
     Where one long face is opposite several short faces, as between a corridor and its rooms, each pair becomes a sheet.
-    Gaps of up to `THICKEST` between these sheets are closed. Sheets end midway between the faces' ends, so that corners
-    meet.
+    Gaps of up to `THICKEST` between these sheets are closed. Each sheet ends midway between the ends of its two faces,
+    so that sheets meet at corners.
 
-    Where one face is longer than the opposite face, the remaining part is kept as a sheet in the same plane. The short
-    lines that close the outline of a wall are left out. If the walls of a type have no given thickness, their thickness
-    is the median distance between their faces, weighted by length.
+    Where one face is longer than the opposite face, the excess is kept as a sheet in the plane of the merged sheet. The
+    short lines that close the outline of a wall are left out. If the walls of a type have no given thickness, their
+    thickness is the median distance between their faces, weighted by length.
 
     If less than half of a type's total line length has an opposite face, each line of the type is treated as a wall.
     In this case, two lines that are close together are separate walls, and both lines are kept.
@@ -107,7 +107,7 @@ def _face_pairs(segments: Sequence[Segment]) -> list[tuple[int, int]]:
         if distance is not None:
             distances[other, one] = distance
             nearest[[one, other]] = np.minimum(nearest[[one, other]], distance)
-    # A face has one opposite face, which may be drawn in pieces at nearly the same distance.
+    # A face has one opposite face, which may be drawn as several lines at nearly the same distance.
     return [
         pair for pair, distance in sorted(distances.items()) if (distance <= nearest[list(pair)] + 0.01).all()
     ]
@@ -173,8 +173,8 @@ def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
 def _merge_pair(one: Segment, other: Segment) -> Segment:
     """The sheet between two overlapping faces; where their ends are close, the sheet ends midway between the ends."""
     low, high = sorted(_relative(one, other)[0].tolist())
-    # At a corner, one face ends one wall thickness before the other. The point midway between their ends is on the
-    # centre line of the other wall.
+    # At a corner, one face ends one wall thickness before the opposite face. The point midway between their ends is on
+    # the centre line of the other wall.
     start = low / 2 if abs(low) <= THICKEST else max(low, 0.0)
     end = (high + one.length) / 2 if abs(high - one.length) <= THICKEST else min(high, one.length)
     sheet = _part(one, start, end, _offset(one, other) / 2)
@@ -182,7 +182,7 @@ def _merge_pair(one: Segment, other: Segment) -> Segment:
 
 
 def _left_over(index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment]) -> list[Segment]:
-    """Parts of a face that have no opposite face and are longer than `THICKEST`, moved into the plane of the sheet."""
+    """Parts of a face without an opposite face, if longer than `THICKEST`, moved into the plane of the sheet."""
     face = segments[index]
     opposite = [segments[sum(pair) - index] for pair in pairs if index in pair]
     spans = sorted((*_span(face, other), _offset(face, other)) for other in opposite)
@@ -232,7 +232,7 @@ def _close_gaps(sheets: Sequence[Segment]) -> list[Segment]:
 
 
 def _thicknesses(sheets: Sequence[Segment], distances: Sequence[float]) -> dict[str, float]:
-    """Thickness by type of walls without a given thickness [m]: the median distance of faces, weighted by length."""
+    """Thickness [m], by type, of walls without a given thickness: the median face distance, weighted by length."""
     thickness = {}
     for kind in sorted({sheet.kind for sheet in sheets if sheet.thickness is None} - OPENINGS):
         walls = sorted(

@@ -1,4 +1,4 @@
-"""Checks of scenes: faults in scene files and meshes, and positions that do not match a scene."""
+"""Checks of scenes, which find faults in scene files and meshes, and positions that do not match a scene."""
 
 from calibray.scenes.checks.positions import SceneSurfaces as SceneSurfaces
 from calibray.scenes.checks.positions import building_outlines as building_outlines

@@ -19,13 +19,13 @@ from calibray.scenes.triangles import BATCH, STEEP, Triangles, is_ground, vertic
 from calibray.support.lazy_imports import library
 
 KERB: Final = 2.0
-"""Objects up to this height above the lowest point of a scene, such as kerbs, do not count as buildings [m]."""
+"""Height above the lowest point of a scene up to which objects, such as kerbs, do not count as buildings [m]."""
 
 CLEARANCE: Final = 0.05
 """A surface counts as above an antenna if it is higher than the antenna by more than this distance [m]."""
 
 CONTACT: Final = 0.01
-"""An antenna closer than this distance to a level surface counts as touching the surface [m]. At a distance of 1 mm,
+"""Distance from a level surface below which an antenna counts as touching the surface [m]. At a distance of 1 mm,
 Sionna RT misses reflections from the surface on all links; at 3 mm, on most links; at 10 mm, on none."""
 
 BEYOND: Final = "outside the scene"
@@ -55,8 +55,8 @@ class SceneSurfaces:
     """The faces of a scene, with walls separate from ground, floors and roofs.
 
     Attributes:
-        level: Corners of the faces that are not walls [F, 3, 3], [m].
-        walls: Corners of the walls [W, 3, 3], [m].
+        level: Corners [F, 3, 3], [m], of the faces that are not walls.
+        walls: Corners [W, 3, 3], [m], of the walls.
         bounds: West, south, bottom, east, north and top of the scene [6], [m].
     """
 
@@ -120,7 +120,7 @@ class SceneSurfaces:
         return np.asarray(((position < low) | (position > high)).any(axis=1))
 
     def ground_height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Height of the lowest surface [n], [m], at eastings and northings [n], [m].
+        """Height [n], [m], of the lowest surface at the given eastings and northings [n], [m].
 
         Raises:
             InputError: The scene has no surface at a position, or shapely is not installed.
@@ -149,7 +149,7 @@ class SceneSurfaces:
         return lowest
 
     def _count_surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Number of surfaces at each position in plan, and number of surfaces above the position [n]."""
+        """Number [n] of surfaces at each position in plan, and number [n] of these surfaces above the position."""
         index, height = self._surfaces(position)
         above = height > position[index, 2] + CLEARANCE
         return np.bincount(index, minlength=len(position)), np.bincount(index[above], minlength=len(position))
@@ -163,8 +163,8 @@ class SceneSurfaces:
     def _surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """All surfaces at the given positions: index of the position, and height of the surface [m]."""
         shapely = library("shapely", "scenes")
-        # A point on an edge belongs to both faces, so callers compare the counts with zero or with each other, not with
-        # one.
+        # A point on an edge belongs to both faces, so callers compare the number of surfaces with zero or with other
+        # counts, not with one.
         index, face = self._tree.query(shapely.points(position[:, :2]), predicate="intersects")
         a, b, c = np.moveaxis(self.level[face], 1, 0)
         normal = np.cross(b - a, c - a)
@@ -187,7 +187,7 @@ def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLi
     counts = [np.zeros(0, dtype=np.int64)]
     for number in range(0, len(first), batch):
         part = slice(number, number + batch)
-        # Misses are NaN: they sort last and do not count as crossings.
+        # The distance is NaN for a triangle that a line misses; NaN values sort last and do not count as crossings.
         distance = np.sort(crossing(first[part, None], last[part, None], corners), axis=1)
         counts.append((np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING).sum(axis=1))
     return np.concatenate(counts)
@@ -258,8 +258,8 @@ def move_outside(
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
     """The location of each point [n, 3], [m]: `BEYOND`, `UNDER`, `INSIDE`, or an empty string for a point in the open.
 
-    A point is inside a building if an upward vertical ray crosses an odd number of surfaces, as it does inside any
-    closed body. The ground consists of the triangles marked in `Triangles.ground`.
+    A point is inside a building if an upward vertical ray from the point crosses an odd number of surfaces, as it does
+    from inside any closed body. The ground consists of the triangles marked in `Triangles.ground`.
     """
     if not len(triangles.face):
         return np.full(len(points), "")

@@ -24,14 +24,14 @@ from calibray.support.progress import Progress
 
 Severity = Literal["error", "warning", "note"]
 
-_FLAT: Final = 1e-10  # area below which a face counts as empty [m^2]
+_FLAT: Final = 1e-10  # area below which the area of a face counts as zero [m^2]
 
 CLOSE: Final = 0.01
 """Distance below which Sionna RT confuses parallel faces [m]. At 10 m from the origin, Sionna RT found two reflections
-from sheets 1 mm apart and no path through walls 0.1 to 5 mm apart. A gap of 10 mm was enough. At 900 m from the origin,
-a gap of 100 mm was necessary."""
+from sheets 1 mm apart and no path through walls 0.1 to 5 mm apart. At this distance from the origin, a gap of 10 mm was
+sufficient; at 900 m, a gap of 100 mm was necessary."""
 
-_PARALLEL: Final = 0.999  # smallest cosine of the angle between the normals of parallel faces
+_PARALLEL: Final = 0.999  # minimum cosine of the angle between the normals of faces that count as parallel
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Finding:
     Attributes:
         severity: "error" if Sionna RT or Calibray refuses the scene, "warning" if results may be wrong, otherwise
             "note".
-        subject: The object, material or file concerned; empty for the scene itself.
+        subject: The object, material or file with the fault; empty for the scene itself.
         problem: Description of the fault.
         remedy: How to correct the fault.
     """
@@ -62,8 +62,8 @@ class MeshFaults:
         vertices: Number of vertices.
         faces: Number of triangles.
         open_edges: Number of edges that belong to only one face, even after vertices at the same position are merged.
-        unwelded_edges: Number of edges at which two faces meet without sharing vertices, so no wedge is found.
-        crowded_edges: Number of edges shared by more than two faces, so no wedge is found.
+        unwelded_edges: Number of edges at which two faces meet without sharing vertices, so that no wedge is found.
+        crowded_edges: Number of edges shared by more than two faces, so that no wedge is found.
         flipped_faces: Number of faces whose normals point inward, or opposite to the normals of their neighbours.
         empty_faces: Number of faces with zero area.
         repeated_faces: Number of faces with the same corners as another face.
@@ -204,7 +204,7 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
 
 
 def scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
-    """Faults in units and heights, derived from the lower and upper corners [3] of the scene's bounds."""
+    """Faults in the unit and the heights of a scene, given the lower and upper corners [3] of its bounds."""
     extent = high - low
     width = float(extent[:2].max())
     size = f"{extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g}"
@@ -249,11 +249,11 @@ def _overlap_findings(root: ElementTree.Element, path: Path) -> Iterator[Finding
 
 
 def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of a parallel face that is closer than `CLOSE` to the centroid of each face [F]; -1 if there is none.
+    """For each face, index [F] of a parallel face that is closer than `CLOSE` to its centroid; -1 if there is none.
 
-    Faces are [F, 3, 3], [m]. The index is also -1 for faces that rays cannot reach from outside: walls between touching
-    buildings, and floors of buildings on the ground. A side of a face is in the open if a straight line from it crosses
-    an even number of faces.
+    `corners` [F, 3, 3] are the corners of the faces [m]. The index is also -1 for faces that rays cannot reach from
+    outside, such as walls between touching buildings and floors of buildings on the ground. A side of a face is in the
+    open if a straight line from it crosses an even number of faces.
     """
     cover = np.full(len(corners), -1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -273,8 +273,8 @@ def find_covers(corners: NDArray[np.float64]) -> NDArray[np.int64]:
             gap = height - centroid[point, 2]
             own = members[point]
             cosine = np.abs((normal[face] * normal[own]).sum(axis=1))
-            # The gap along this axis times the component of the normal along the axis is the distance between the
-            # faces.
+            # The distance between the faces is the gap along this axis times the component of the normal along the
+            # axis.
             near = (cosine > _PARALLEL) & (np.abs(gap * normal[own, axis]) < CLOSE) & (face != own)
             found[point[near]] = face[near]
             np.add.at(above, point, gap > CLOSE)
@@ -325,10 +325,10 @@ def _count_flipped(
 ) -> int:
     """Count the faces with wrong normals.
 
-    The faces of each connected piece are first given a consistent orientation. The correct orientation is known for two
-    kinds of pieces. The signed volume of a piece that is closed, or open only at its bottom, must be positive. The
-    normal of a horizontal sheet must point up. For any other piece, such as a wall, either side may be outside, and the
-    faces that differ from the majority are counted.
+    First, the faces of each connected component are oriented consistently. The correct orientation is known for two
+    types of component. A component that is closed, or open only at its bottom, must have a positive signed volume. A
+    horizontal sheet must have an upward normal. For any other component, such as a wall, either side may be outside,
+    and the faces whose orientation differs from that of the majority are counted.
     """
     if not len(faces):
         return 0
@@ -338,7 +338,7 @@ def _count_flipped(
     np.minimum.at(base, piece, np.minimum(np.minimum(a, b), c))
     normal = np.cross(b - a, c - a) * orientation[:, None]
     # Divergence theorem: positive if the normals of a closed body point outwards. Positions are relative to the lower
-    # bounds of the piece, which avoids cancellation of large coordinates.
+    # bounds of the component, which avoids cancellation of large coordinates.
     volume = np.bincount(piece, (normal * (a - base[piece])).sum(axis=1) / 6)
     area = np.bincount(piece, np.linalg.norm(normal, axis=1) / 2)
     # Twice the signed area in plan; for a level sheet, more than its total area.
@@ -361,7 +361,7 @@ def _open_above(
     by_position: NDArray[np.int64],
     lowest: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Number of open edges of each face that lie above `lowest`, the bottom of its connected piece [F]."""
+    """Number [F] of open edges of each face that lie above `lowest`, the bottom of its connected component."""
     _, edge, uses = _edges(by_position)
     is_open = (uses == 1)[edge].reshape(-1, 3)
     height = vertices[faces][:, :, 2]
@@ -370,7 +370,7 @@ def _open_above(
 
 
 def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sign [F], +1 or -1, that orients each face consistently with its neighbours, and index of its component [F]."""
+    """Sign [F], +1 or -1, that orients each face consistently with its neighbours, and index [F] of its component."""
     count = len(faces)
     sides, edge, uses = _edges(faces)
     order = np.argsort(edge, kind="stable")

@@ -2,7 +2,7 @@
 
 from calibray.tracing import llvm
 
-# This call precedes the imports below because they load Dr.Jit, which would abort the process with an unsuitable LLVM.
+# This call precedes the imports below, which load Dr.Jit; with an unsuitable LLVM, Dr.Jit would abort the process.
 llvm.prepare()
 
 from calibray.tracing.sionna.tracer import Trace, Tracer  # noqa: E402

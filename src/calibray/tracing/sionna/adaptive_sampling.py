@@ -1,7 +1,7 @@
 """Rays are added in rounds until path loss converges (`trace.samples = "auto"`).
 
 Each round launches as many rays as all earlier rounds together, but in different directions. The interaction sequences
-that the rays find depend only on the source; new sequences are tried for every receiver by the method of images
+that the rays find depend only on the source; for every receiver, new sequences are tested by the method of images
 (`image_method`). The search ends after two successive rounds in which no link's path loss changes by more than
 `CONVERGED_DB`. The last round is equivalent to a second trace with twice as many rays (`calibray.tracing.convergence`).
 """
@@ -39,9 +39,9 @@ from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
 
 CONVERGED_DB: Final = 0.05
-"""Maximum change in a link's path loss in one round at which the link counts as converged [dB]."""
+"""Maximum change in a link's path loss in one round for the link to count as converged [dB]."""
 QUIET_ROUNDS: Final = 2
-"""The search ends after this many consecutive rounds without a change above `CONVERGED_DB`."""
+"""Number of consecutive rounds without a change above `CONVERGED_DB` after which the search ends."""
 MAX_LAUNCHES: Final = 256
 """Maximum number of launches per source: 64 million rays."""
 GEOMETRY_BATCH: Final = 500_000
@@ -53,7 +53,7 @@ _LOG: Final = logging.getLogger(__name__)
 class SequenceCache:
     """Interaction sequences of the most recently traced sources.
 
-    Sequences apply to all receivers, so rays are launched only once for all chunks of links that one worker traces.
+    Sequences apply to all receivers, so rays are launched only once for all the chunks of links that a worker traces.
     """
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class SequenceCache:
     def of_source(
         self, solver: Solver, source: NDArray[np.float64], materials: Mapping[str, Material]
     ) -> SourceSequences:
-        """The sequences of a source [3], [m], for these materials, which determine how rays continue."""
+        """The sequences of a source [3], [m], for these materials, which influence the interactions of rays."""
         key = source.tobytes(), solver.settings, tuple(materials.items())
         if key not in self._sequences:
             while len(self._sequences) >= 4:  # the latest four are kept for the next links
@@ -98,7 +98,7 @@ class SourceSequences:
         return self._new_by_launch[number]
 
     def _launch(self, number: int, max_paths: int) -> PathsBuffer:
-        """Launch the rays of launch `number`."""
+        """Send the rays of launch `number`."""
         seed = self._solver.settings.seed
         # Each launch after the first shifts the lattice by a random vector, modulo the unit square.
         shift = np.random.default_rng([seed, number]).random((2, 1)) * (number > 0)
@@ -121,7 +121,7 @@ class AdaptiveSearch:
     """A search for the paths of links, with rays added in rounds.
 
     Attributes:
-        solver: The solver, with its materials set.
+        solver: The solver, in which the material constants are already set.
         cache: Sequences that earlier searches found.
         materials: Material constants of the trace.
         backwards: Whether the receivers send the rays.
@@ -139,8 +139,8 @@ class AdaptiveSearch:
     ) -> tuple[tuple[TracedBuffer, ...], dict[str, object]]:
         """Find the paths from the source of every launch to the other ends of the links [L, 3], [m].
 
-        Returns the paths, the maximum number of rays per source, and the maximum change of any link in the last round.
-        `progress` is called before the first source and after each source.
+        Returns the paths, and a record of the maximum number of rays per source and the maximum change in the path loss
+        of any link in the last round. `progress` is called before the first source and after each source.
 
         Raises:
             EngineError: The paths do not fit into memory.
@@ -254,12 +254,12 @@ class _SourceSearch:
         return TracedBuffer(candidates, source, target, self._launch.links[np.array(end, dtype=np.int64)])
 
     def _keep(self, parts: list[TracedBuffer]) -> NDArray[np.float64]:
-        """Keep the new paths, and return the power that each link gained [R]."""
+        """Keep the new paths, and return the power [R] that each link gained."""
         is_first = not self.traced
         # The first buffer holds the direct paths and is kept even if empty: it defines the ends of the links.
         new = [part for part in parts if len(part.link) or is_first]
         if new and not is_first:
-            # Rounding may split a plane in two, so the same sequence may be tried twice.
+            # Rounding may split a plane into two, so the same sequence may be tested twice.
             earlier = self.traced[1:]
             new = drop_repeats([*earlier, *new])[len(earlier) :]
         self.traced += new

@@ -19,10 +19,10 @@ from calibray.tracing.trace_plan import find_repeats
 
 
 def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
-    """Copy numbers [n], converted to a data type, to memory aligned to 64 bytes.
+    """Convert numbers [n] to a data type, and copy them to memory aligned to 64 bytes.
 
     Dr.Jit uses NumPy's memory without copying it and compiles a separate kernel for each alignment. With random
-    alignment, the kernel cache of Dr.Jit rarely hits, and every process spends seconds on compilation.
+    alignment, a kernel is rarely found in Dr.Jit's cache, and every process spends seconds on compilation.
     """
     memory = np.empty(values.size * np.dtype(dtype).itemsize + 64, dtype=np.uint8)
     start = -memory.ctypes.data % 64
@@ -40,8 +40,8 @@ def to_points(position: NDArray[np.float64]) -> mi.Point3f:
 
 def to_numpy(vectors: Any) -> NDArray[np.float64]:
     """Convert points or vectors to double precision [n, 3]."""
-    # Without this evaluation, one kernel would compute and interleave the values, and would be compiled again for each
-    # number of vectors.
+    # Without this evaluation, the kernel that computes the values would also interleave them, and would be compiled
+    # again for each number of vectors.
     dr.eval(vectors)
     return np.stack([np.array(axis, dtype=float) for axis in vectors], axis=-1)
 
@@ -65,7 +65,7 @@ def vertices_of(buffer: PathsBuffer) -> NDArray[np.float64]:
 
 
 def normals_at(buffer: PathsBuffer, step: int, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Read the surface normals at interaction `step` of paths [P, 3]; values outside the mask [P] are undefined."""
+    """Read the surface normals [P, 3] at interaction `step` of paths; values outside the mask [P] are undefined."""
     depth, active = dr.opaque(mi.UInt, step + 1), mi.Bool(aligned(mask, np.bool_))
     return to_numpy(buffer.get_primitive_props(depth, True, False, active))
 
@@ -76,8 +76,8 @@ class TracedBuffer:
 
     Attributes:
         buffer: The P paths.
-        source: Transmitters at which they start.
-        target: Receivers at which they end.
+        source: Transmitters at which the paths start.
+        target: Receivers at which the paths end.
         link: Link of every path [P].
     """
 
@@ -101,7 +101,7 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
 
 
 def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
-    """Remove repeated paths found by several launches to the same receivers; keep random samples of diffuse reflection.
+    """Remove paths that an earlier launch to the same receivers found; keep random samples of diffuse reflection.
 
     Buffers are in the order of the launches; paths that an earlier buffer contains are removed from later buffers.
     """
@@ -159,7 +159,7 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
 def _zero_face_is_dark(
     buffer: PathsBuffer, kind: NDArray[np.int64], source: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether the 0-face of each candidate's edge faces away from the incident wave [P]."""
+    """Mask [P] of the candidates with an edge whose 0-face is turned away from the incident wave."""
     # For any point of the edge, the wave comes from the image of the source in the planes before the edge.
     image, vertex = source.copy(), vertices_of(buffer)
     before_edge = np.ones(len(kind), dtype=bool)

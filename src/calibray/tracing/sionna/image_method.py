@@ -35,8 +35,8 @@ from calibray.tracing.sionna.buffers import aligned, per_interaction, to_numpy
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3
-"""Maximum difference between the offsets of equal planes [m]; their normals differ by at most a fiftieth of this
-number."""
+"""Maximum difference between the offsets of planes that count as equal [m]; their normals differ by at most a fiftieth
+of this number."""
 CONFUSABLE_PLANE: Final = 0.05
 """Maximum difference between the offsets of planes that the tracer can confuse in single precision [m]."""
 MARGIN: Final = 0.1
@@ -46,7 +46,7 @@ corners.
 NEAR_PLANE: Final = 0.01
 """Distance from a plane below which a point can be on either side of the plane [m]."""
 PAIRS_PER_BATCH: Final = 8_000_000
-"""Maximum number of sequence-receiver pairs that are tested together, to limit memory use."""
+"""Maximum number of sequence-receiver pairs that are tested at the same time, to limit memory use."""
 
 
 class Surfaces:
@@ -73,7 +73,7 @@ class Surfaces:
         self._tree = KDTree(np.vstack([self._feature, -self._feature])) if len(grid) else None
 
     def bounding_boxes(self, plane: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Smallest and largest coordinates [n, 3], [m], of boxes around all surfaces in or very close to planes [n].
+        """Smallest and largest coordinates [n, 3], [m], of boxes around all surfaces in, or very close to, planes [n].
 
         The tracer can confuse surfaces that are this close together.
         """
@@ -108,8 +108,8 @@ class Edges:
 class Unfolded:
     """Unfolded sequences of one source; C sequences of at most D interactions.
 
-    Traced back from the receiver, a path aims at `aim` + x `slide` at every interaction, where x is the distance of the
-    diffraction point from the edge's origin [m].
+    A path that is traced back from the receiver aims, at every interaction, at `aim` + x `slide`, where x is the
+    distance [m] of the diffraction point from the edge's origin.
 
     Attributes:
         kind: Kinds of interaction, 0 after the last interaction [C, D].
@@ -157,7 +157,7 @@ def unfold(
     aim, slide = np.zeros((*kind.shape, 3)), np.zeros((*kind.shape, 3))
     after_edge = np.zeros((len(kind), 1), dtype=bool)
     for step in range(kind.shape[1]):
-        # Mirror image of a point p in the plane n . x = d: p - 2 (n . p - d) n; n = 0 leaves it unchanged.
+        # Mirror image of a point p in the plane n . x = d: p - 2 (n . p - d) n; n = 0 leaves p unchanged.
         n = normal[:, step] * mirrors[:, step, None]
         d = offset[:, step, None] * mirrors[:, step, None]
         image = image - 2 * (_dot(image, n) - d) * n
@@ -214,14 +214,14 @@ class Meshes:
         self.surfaces = Surfaces(np.concatenate(corners) if corners else np.zeros((0, 3, 3)))
 
     def triangles(self, shape: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Indices of triangles in the scene [...], given shapes and indices within these shapes; 0 without a shape."""
+        """Indices [...] of triangles in the scene, given shapes and indices within these shapes; 0 without a shape."""
         distinct, position = np.unique(shape, return_inverse=True)
         starts = np.array([self._first.get(key, -1) for key in distinct.tolist()], dtype=np.int64)
         first = starts[position.reshape(shape.shape)]
         return np.where(first >= 0, first + primitive, 0)
 
     def triangles_of(self, sequences: PathsBuffer) -> NDArray[np.int64]:
-        """Indices in the scene of the triangles at which sequences interact [C, D]; 0 without a triangle."""
+        """Indices [C, D], in the scene, of the triangles at which sequences interact; 0 without a triangle."""
         return self.triangles(per_interaction(sequences, "shapes"), per_interaction(sequences, "primitives"))
 
 

@@ -41,7 +41,7 @@ DIRECTIONS: Final = 64
 
 
 def materials_of_shapes(numbers: Iterable[int]) -> dict[int, str]:
-    """Names of the materials of shapes, by their number in Mitsuba; shapes of a scene that was deleted are missing."""
+    """Material name of each shape, by the shape's number in Mitsuba; shapes of deleted scenes are left out."""
     shapes = {number: dr.reinterpret_array(mi.ShapePtr, mi.UInt32(number))[0] for number in numbers}
     return {number: shape.bsdf().id() for number, shape in shapes.items() if shape is not None}
 
@@ -52,12 +52,12 @@ class LiveScene:
 
     Attributes:
         frequency: Carrier frequency [Hz].
-        objects: One mesh per connected surface, because Sionna merges objects.
+        objects: One mesh for each connected surface, because Sionna merges the scene's original objects.
         materials: The materials that objects use, by name.
         antennas: Transmit and receive antenna.
-        tx: Positions of the transmitters by name [3], [m].
-        rx: Positions of the receivers by name [3], [m].
-        tx_power_dbm: Transmitted power by name of the transmitter [dBm].
+        tx: Position [3], [m], of each transmitter, by name.
+        rx: Position [3], [m], of each receiver, by name.
+        tx_power_dbm: Transmit power [dBm] of each transmitter, by name.
     """
 
     frequency: float
@@ -103,8 +103,9 @@ class LiveScene:
 def apply_materials(scene: object, materials: Mapping[str, Material], frequency: float | None = None) -> None:
     """Set the constants of a scene's materials by name.
 
-    The constants are valid at one carrier frequency, `frequency` [Hz]; if the scene has a different carrier frequency,
-    a warning is given. After this call, setting `scene.frequency` does not replace the constants of ITU materials.
+    The constants are valid only at the carrier frequency `frequency` [Hz]; if the scene has a different carrier
+    frequency, a warning is given. After this call, setting `scene.frequency` does not replace the constants of ITU
+    materials.
 
     Raises:
         InputError: The object is not a Sionna RT scene, or the scene lacks a material; in both cases, nothing is set.
@@ -138,7 +139,7 @@ def _checked(scene: object) -> Any:
 
 
 def _objects(item: Any) -> Iterator[MeshObject]:
-    """The connected surfaces of an object; their names differ from the names of materials."""
+    """The connected surfaces of an object; the names of the surfaces differ from the names of materials."""
     values = mi.traverse(item.mi_mesh)
     vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
     face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)

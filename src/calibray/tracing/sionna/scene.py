@@ -34,7 +34,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 
 def load_scene(scene: Scene) -> rt.Scene:
-    """Load a scene into Sionna RT, in its local frame; its mesh files are found relative to the scene file.
+    """Load a scene, in its local frame, into Sionna RT; paths of mesh files are relative to the scene file.
 
     Raises:
         InputError: Sionna cannot load the scene, or its surfaces differ from the surfaces in the files.
@@ -77,10 +77,10 @@ def _load(xml: str, path: Path) -> rt.Scene:
 
 
 def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
-    """Raise an error if the bounds or areas of surfaces in Mitsuba's memory differ from the files.
+    """Raise an error if the bounds or areas of surfaces in Mitsuba's memory differ from those in the files.
 
-    Mitsuba reads mesh files itself; a type or layout that it misreads would remove reflections without a message.
-    Mitsuba merges the objects of a material into one mesh, so the comparison is by material.
+    Mitsuba reads mesh files itself; if it misread a data type or a file layout, reflections would be lost without a
+    message. Mitsuba merges the objects of a material into one mesh, so the comparison is by material.
 
     Raises:
         InputError: A surface differs.
@@ -120,7 +120,7 @@ def _size(shape: Any) -> SurfaceSize:
 
 
 def surfaces_agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin: NDArray[np.float64]) -> bool:
-    """Whether a surface in the local frame equals, in single precision, the surface of objects in the scene frame."""
+    """Whether a surface in the local frame agrees, to within single precision, with objects in the scene frame."""
     if not traced:
         return False
     low, high = np.min([size.low for size in stored], axis=0), np.max([size.high for size in stored], axis=0)
@@ -140,7 +140,7 @@ def surfaces_agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin:
 
 
 def shape_ids(mitsuba_scene: Any) -> dict[int, Any]:
-    """Mitsuba's shapes, by the ids with which path buffers refer to the shapes."""
+    """Mitsuba's shapes, by the ids that path buffers use for the shapes."""
     return {
         int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): shape
         for shape in mitsuba_scene.shapes()
@@ -164,7 +164,7 @@ def scattering_pattern(material: Material) -> rt.ScatteringPattern:
 
 
 def antenna_patterns(antenna: Antenna) -> list:
-    """Make an antenna's patterns for Sionna's field stage: functions of zenith and azimuth [rad], one per port."""
+    """Make an antenna's patterns for Sionna's field stage: one function of zenith and azimuth [rad] per port."""
     if antenna.gain_file is None and not antenna.is_array:
         make: Any = antenna_pattern_registry.get(antenna.pattern)
         return make(polarization=antenna.polarization).patterns

@@ -1,8 +1,8 @@
 """Sionna RT's solver, stage by stage: candidate paths from rays, exact geometry from the method of images, and fields.
 
-The first two stages depend on the material constants only through the choice of a ray's next interaction. The result of
-these stages is therefore kept and compiled into a path program. The field stage is the reference against which replay
-is tested.
+The first two stages depend on the material constants only through the choice of a ray's next interaction. The paths
+from these two stages are therefore kept and compiled into a path program. The field stage is the reference against
+which replay is tested.
 """
 
 # Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
@@ -52,7 +52,7 @@ from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scatteri
 from calibray.tracing.trace_plan import SMALL_LAUNCH
 
 HASHES: Final = (16_777_213, 67_108_859)
-"""Number of entries in Sionna's hash table for small and for large launches. Sionna drops candidates whose hashes
+"""Numbers of entries in Sionna's hash table, for small and for large launches. Sionna drops candidates whose hashes
 collide. Of 31,430 candidates in a launch to 25 receivers, Sionna drops 1,067 with its default of one million entries,
 36 with 16 million, and 4 with 67 million. A table of 67 million entries takes 0.5 GB and 0.3 s per launch. The numbers
 are primes, because the lowest bits of the hashes vary least."""
@@ -112,13 +112,13 @@ class Solver:
         return self._scene.mi_scene
 
     def with_settings(self, settings: TraceSettings) -> Solver:
-        """Copy the solver with different settings; the loaded scene is shared."""
+        """Copy the solver, with different settings; the copy shares the loaded scene."""
         other = copy(self)
         other.settings = settings
         return other
 
     def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
-        """Set the constants of Sionna's materials, as given or otherwise from the scene, and return all constants."""
+        """Set the constants of Sionna's materials, either as given or from the scene, and return all constants."""
         for name in materials:
             check_material_name(name, self.scene.materials, "materials")
         constants = {**self.scene.materials, **materials}
@@ -182,8 +182,8 @@ class Solver:
     ) -> None:
         """Compute the exact geometry of candidates by the method of images, in place.
 
-        Candidates that are not paths are dropped, as are candidates of receivers that `pad_receivers` added after the
-        first `num_receivers`. Receivers are the targets, or the sources if candidates were reversed.
+        Candidates that turn out not to be paths are dropped, as are candidates of the receivers that `pad_receivers`
+        added after the first `num_receivers`. Receivers are the targets, or the sources if candidates were reversed.
         """
         if not buffer.buffer_size:
             return
@@ -224,7 +224,7 @@ class Solver:
         )
         # Both arrays are evaluated together; otherwise, reading each array would run the whole stage again.
         dr.eval(fields.a, fields.tau)
-        # The field stage may mark paths as invalid; the marks are restored, so that the stage can run again.
+        # The field stage may mark paths as invalid; the original marks are restored, so that the stage can run again.
         buffer.valid = valid
         return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
 
@@ -291,7 +291,7 @@ def _hash_table(entries: int) -> Iterator[None]:
 @contextmanager
 def _ray_directions(directions: NDArray[np.float64] | None) -> Iterator[None]:
     """Set the directions of Sionna's rays, as points of the unit square [2, rays]; Sionna's own lattice if None."""
-    # Sionna has no argument for directions, so the function that makes its lattice is replaced.
+    # Sionna has no argument for the directions of rays, so the function that makes the lattice is replaced.
     sionna_lattice = sb_deterministic.fibonacci_lattice
     if directions is not None:
         sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(

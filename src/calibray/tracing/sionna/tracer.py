@@ -1,8 +1,8 @@
 """Sionna RT as a `Tracer`: finds the paths of links and compiles them.
 
 All receivers of a source share Sionna's path buffer, whose memory grows with samples x depth x receivers
-(NVlabs/sionna#1172). Receivers, and rays if needed, are therefore split over launches (`calibray.tracing.trace_plan`).
-A launch that fills its buffer is repeated with a larger buffer.
+(NVlabs/sionna#1172). Receivers, and rays if needed, are therefore divided among launches
+(`calibray.tracing.trace_plan`). A launch that fills its buffer is repeated with a larger buffer.
 """
 
 # Mitsuba defines its types only when a variant is chosen, so its stubs declare these types as plain objects.
@@ -57,7 +57,8 @@ class Trace:
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
         buffers: The paths.
-        record: Entries for the settings of the path program: launched rays and convergence of an adaptive search.
+        record: Entries for the settings of the path program: the number of rays and the convergence of an adaptive
+            search.
     """
 
     solver: Solver
@@ -83,7 +84,7 @@ class Trace:
         return self._all_links()[self._order()]
 
     def delay(self) -> NDArray[np.float64]:
-        """Sionna's propagation delays in the order of `link` [P], [s]; available once `path_gains` has run."""
+        """Sionna's propagation delays [P], [s], in the order of `link`; available after `path_gains` has run."""
         delays = [
             np.array(part.buffer.tau, dtype=float) if len(part.link) else np.zeros(0) for part in self.buffers
         ]
@@ -92,7 +93,7 @@ class Trace:
     def path_gains(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
         """Path gains [P, R, T] from Sionna's field stage, in the order of `paths()`.
 
-        `materials` override, by material name, the constants used for the trace.
+        `materials` gives, by name, constants that replace those used for the trace.
         """
         self.solver.set_materials({**self.materials, **(materials or {})})
         return np.concatenate([self.solver.compute_fields(part) for part in self.buffers])[self._order()]
@@ -146,7 +147,7 @@ class Tracer:
         return self.solver.settings
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
-        """Copy the tracer with different settings; the loaded scene is shared."""
+        """Copy the tracer, with different settings; the copy shares the loaded scene."""
         other = copy(self)
         other.solver = self.solver.with_settings(settings)
         return other
@@ -163,7 +164,7 @@ class Tracer:
     ) -> Paths:
         """Find the paths of every link and compile them; see `calibray.tracing.protocol.Tracer.trace`."""
         paths = self.find_paths(links, progress, materials).paths()
-        # Dr.Jit keeps freed buffers for its next kernel: 1.7 GB after a trace of a million rays.
+        # Dr.Jit keeps freed buffers for its next kernel; after a trace of a million rays, these buffers occupy 1.7 GB.
         dr.flush_malloc_cache()
         return paths
 
@@ -192,7 +193,7 @@ class Tracer:
         traced: list[TracedBuffer] = []
         same_receivers: list[
             TracedBuffer
-        ] = []  # of consecutive launches that share the rays to the same receivers
+        ] = []  # of consecutive launches among which the rays to the same receivers are divided
         num_paths = done = 0
         if progress is not None:
             progress("tracing", 0, len(rx))
@@ -219,7 +220,7 @@ class Tracer:
             count=launch.rays,
             seed=launch.seed,
             directions=share,
-            # Only the first of the launches to the same receivers searches for direct paths.
+            # Among launches to the same receivers, only the first searches for direct paths.
             direct=settings.line_of_sight and launch.first == 0,
             buffer_size=BUFFER,
             max_paths=max_paths,
