@@ -257,7 +257,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
 def _on_other_floor(
     triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether one end [n, 3], [m], has fewer ground sheets below it and more above it than the other end [n].
+    """Mask [n] of the links of which one end has fewer ground sheets below it and more above it than the other end.
 
     If one count is equal at both ends, for example where a floor has a hole, the result is False.
     """

@@ -56,7 +56,7 @@ TRACED: Final = "mat-calibray-"
 """Prefix of material ids in the scene for the tracer, followed by the index in `Scene.materials`."""
 
 ITU_NAMES: Final = frozenset(name for table in ITU_MATERIALS.values() for name in table)
-"""Names of the materials in all revisions of ITU-R P.2040, which Sionna RT reserves."""
+"""Names of the materials in all revisions of ITU-R P.2040; Sionna RT reserves these names."""
 
 _MATERIAL_FIELDS: Final = frozenset(entry.name for entry in fields(Material))
 _BULK_FIELDS: Final = frozenset({"relative_permittivity", "conductivity"})

@@ -61,8 +61,8 @@ class Triangles:
 
     Attributes:
         vertex: Positions [V, 3], [m].
-        face: Vertex indices of each triangle [F, 3].
-        material: Index of each triangle's material in `Scene.materials` [F].
+        face: Vertex indices [F, 3] of each triangle.
+        material: Index [F] of each triangle's material in `Scene.materials`.
         ground: Mask [F] of the triangles that belong to a ground sheet, such as terrain, a floor or a ceiling.
         left_out: Names of the objects that could not be read.
     """

@@ -25,15 +25,15 @@ LONG_TRACE_SECONDS: Final = 30.0
 SHORT_TRACE_SECONDS: Final = 1.0
 """Duration below which a trace with one launch needs no announcement [s]."""
 LANE_BYTES: Final = 40
-"""Peak memory of a lane during tracing [bytes], measured by benchmarks/memory.py --lanes."""
+"""Peak memory per lane during tracing [bytes], measured by benchmarks/memory.py --lanes."""
 PATH_BYTES: Final = (650, 260)
-"""Memory of a path and of each interaction until compilation [bytes], measured by benchmarks/memory.py --paths."""
+"""Memory per path and per interaction until compilation [bytes], measured by benchmarks/memory.py --paths."""
 BUFFER_BYTES: Final = (50, 30)
-"""Memory of a path and of each interaction in the tracer's buffer [bytes]."""
+"""Memory per path and per interaction in the tracer's buffer [bytes]."""
 LANES_PER_SECOND: Final = 3e7
 """Number of lanes that two processor cores trace per second, for estimates of the duration of a trace."""
 ADAPTIVE_SECONDS: Final = 3.0
-"""Approximate duration on two cores for one transmitter if rays are added in rounds [s]."""
+"""Approximate duration per transmitter on two cores if rays are added in rounds [s]."""
 SMALL_LAUNCH: Final = 5_000_000
 """Maximum number of lanes of a small launch; such a launch finds a few thousand candidate paths in at most 0.4 s."""
 POINT_TOLERANCE: Final = 0.01
@@ -201,7 +201,7 @@ def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float
 
 
 def pad_receivers(position: NDArray[np.float64], lanes_per_receiver: int) -> NDArray[np.float64]:
-    """Repeat the last receiver [n, 3] so that only a few distinct receiver counts occur across launches.
+    """Repeat the last receiver [n, 3] so that launches have only a few different numbers of receivers.
 
     The tracer compiles its code for each number of receivers, which takes 1 to 3 s. The number is rounded up to a power
     of two, or to a multiple of the largest power of two for which a launch is small.

@@ -282,7 +282,7 @@ def open_height_model(path: Path) -> Iterator[HeightModel]:
 
     Raises:
         InputError: The file does not exist or is not a GeoTIFF, its coordinate reference system or unit is unknown, its
-            grid is not regular, or a file next to it changes its heights.
+            grid is not regular, or an auxiliary file next to it changes its heights.
     """
     rasterio = library("rasterio", "scenes")
     if not path.is_file():

@@ -33,8 +33,8 @@ class Terrain:
     """Heights of the ground on a grid; a diagonal from south-west to north-east divides each cell into two triangles.
 
     Attributes:
-        x: Eastings of the grid, ascending [nx], [m].
-        y: Northings of the grid, ascending [ny], [m].
+        x: Eastings of the grid [nx], [m], in ascending order.
+        y: Northings of the grid [ny], [m], in ascending order.
         z: Heights [ny, nx], [m].
         repairs: Number of missing heights that were filled in, by reason.
     """

@@ -114,7 +114,7 @@ def _face_pairs(segments: Sequence[Segment]) -> list[tuple[int, int]]:
 
 
 def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int, int]]) -> set[str]:
-    """The types whose lines have an opposite face along at least half of their total length."""
+    """The types whose lines, along at least half of their total length, have an opposite face."""
     length: dict[str, float] = defaultdict(float)
     faced: dict[str, float] = defaultdict(float)
     for segment in segments:

@@ -85,7 +85,7 @@ class LiveScene:
         # Mitsuba loads objects in parallel, so their order in the scene varies between processes.
         items = [item for _, item in sorted(live.objects.items())]
         parts = [part for item in items for part in _objects(item)]
-        # Names become file names.
+        # The names of objects become file names.
         names = unique_names(part.name for part in parts)
         objects = tuple(replace(part, name=name) for part, name in zip(parts, names, strict=True))
         _check_precision(objects)
@@ -228,7 +228,7 @@ def _antenna(end: str, array: Any, devices: Mapping[str, Any]) -> Antenna:
 def _fields(
     patterns: Any, zenith: NDArray[np.float64], azimuth: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
-    """Fields of an antenna's ports along theta and phi [ports, 2, n]."""
+    """Fields [ports, 2, n] of an antenna's ports along theta and phi."""
     fields = [pattern(mi.Float(zenith), mi.Float(azimuth)) for pattern in patterns]
     dr.eval(fields)
     return np.array([[np.array(part.real) + 1j * np.array(part.imag) for part in pair] for pair in fields])

@@ -42,7 +42,7 @@ from calibray.tracing.trace_plan import (
 )
 
 LANES: Final = 20_000_000
-"""Maximum product of rays, interactions and receivers in one launch."""
+"""Maximum product of the numbers of rays, interactions and receivers in one launch."""
 BUFFER: Final = 1_000_000
 """Initial capacity of the buffer of one launch [paths]."""
 
