@@ -77,11 +77,11 @@ LABELS: Final = {
 }
 
 NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
-"""Constructor arguments that are set by other parts of the study, so `method.options` must not contain them."""
+"""Constructor arguments that other parts of the study set, so `method.options` must not contain them."""
 
 
 def method(name: str) -> type[Optimizer]:
-    """The class of a named method, which declares the parts of an evaluation and the schedule that the method uses.
+    """The class of a named method; it declares which parts of an evaluation the method uses, and the method's schedule.
 
     Raises:
         InputError: There is no such method.
@@ -96,7 +96,7 @@ def method(name: str) -> type[Optimizer]:
 
 
 def label(name: str) -> str:
-    """The label in tables and figures of a method, or of a method with a budget (`METHOD@CALLS`).
+    """The label of a method in tables and figures; the name can include a budget (`METHOD@CALLS`).
 
     Example:
         >>> label("gwo@600")
@@ -120,7 +120,7 @@ def make(
     cheap_model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
-    """Construct the optimizer for a named method; arguments that the method does not use are ignored.
+    """Construct the optimizer of the method with the given name; arguments that the method does not use are ignored.
 
     Args:
         name: A method of `METHODS`.

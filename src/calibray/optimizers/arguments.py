@@ -1,4 +1,4 @@
-"""Checks of constructor arguments, and the search box with its mapping to and from the unit cube."""
+"""Checks of constructor arguments, and the search box with its mappings to and from the unit cube."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibray.errors import InputError
 
 
 def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
-    """Check that the argument `name` is a whole number within the bounds, and return it.
+    """Check that the argument `name` is a whole number within the bounds, and return this number.
 
     Raises:
         InputError: The value is not a whole number, or is out of range.
@@ -30,7 +30,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
 
 
 def real(name: str, value: float, at_least: float, at_most: float = inf) -> float:
-    """Check that the argument `name` is a finite number within the bounds, and return it.
+    """Check that the argument `name` is a finite number within the bounds, and return this number.
 
     Raises:
         InputError: The value is not a finite number, or is out of range.
@@ -43,7 +43,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
 
 
 def choice(name: str, value: str, allowed: Iterable[str]) -> str:
-    """Check that the argument `name` is one of the allowed strings, and return it.
+    """Check that the argument `name` is one of the allowed strings, and return this string.
 
     Raises:
         InputError: The value is not allowed.

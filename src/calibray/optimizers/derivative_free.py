@@ -5,14 +5,15 @@ If a search converges before the budget is used up, the next search starts at a 
 
 POUNDERS: S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends
 in Optimization with Engineering Applications, SIAM (2017), ch. 40. POUNDERS is implemented here because the authors'
-package IBCDFO needs a solver (MINQ) that is not in any package index. Each residual is modelled by the quadratic of
-least curvature that interpolates evaluated points near the best point. The sum of the squared models, to second order,
-is minimized in a box-shaped trust region. Points that span all directions within the region are chosen first, because
-they make the models fully linear. If a direction is missing and the step failed, a point along this direction is
-evaluated before the region shrinks.
+package IBCDFO depends on a solver (MINQ) that no package index offers. Each residual is modelled by the quadratic of
+least curvature that interpolates the residual at evaluated points near the best point. The sum of the squared models is
+expanded to second order and minimized in a box-shaped trust region. Points near the best point that span all directions
+are chosen first, because they make the models fully linear. If a step fails while a direction is missing, a point along
+this direction is evaluated before the region shrinks.
 
-Gauss-Newton is the usual choice if a least-squares solver is available but derivatives are not. Every accepted point
-requires one further evaluation per parameter, all in one batch. `descent.py` computes the steps.
+Gauss-Newton is the usual choice if a least-squares solver is available but derivatives are not. At every accepted
+point, one further evaluation per parameter is required; these evaluations form one batch. `descent.py` computes the
+steps.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Search, Session, first_start, limited
 
 SPANNING: Final = (1.75, 10.0)
-"""Maximum distances of spanning points for a fully linear model and for any model, in units of radius x sqrt(d)."""
+"""Maximum distances of spanning points, for a fully linear model and for any model, in units of radius x sqrt(d)."""
 
 NEW_DIRECTION: Final = 1e-3
 """Smallest component of a spanning point along a new direction, divided by max(distance, radius) (theta_1)."""
@@ -39,7 +40,8 @@ INDEPENDENT: Final = 1e-3
 """Smallest pivot (see `_pivot`) for which a further point is included in the model (theta_2)."""
 
 ACCEPTED: Final = 0.05
-"""Minimum fraction of the predicted decrease for a successful step; the region then does not shrink."""
+"""Minimum fraction of the predicted decrease that a successful step achieves; after a successful step, the region does
+not shrink."""
 
 LARGEST: Final = 0.5
 """Maximum trust-region radius, as a fraction of the box width."""
@@ -126,8 +128,8 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
         best = int(np.argmin(points.value))
         centre = points.unit[best]
         chosen, missing = _spanning(points, best, radius)
-        # A model needs d points in addition to the best point. If there are too few near points, distant points are
-        # used.
+        # A model needs d points in addition to the best point. If too few nearby points span new directions, distant
+        # points are used.
         if missing is None or len(chosen) == d:
             step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
             if predicted > 0 and np.abs(step).max() > 1e-3 * last:
@@ -145,10 +147,10 @@ def _descend(archive: Archive, start: NDArray[np.float64], radius: float, last: 
 
 
 def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
-    """Find points that span the directions around the best point, and the directions that no point spans.
+    """Find points that span the directions around the best point, and the directions that no nearby point spans.
 
-    Returns the indices of the points, and the missing directions [k, d]. A direction is missing if nearby points do not
-    span it; the model is then not fully linear. The second return value is None if no direction is missing.
+    Returns the indices of the points, and the missing directions [k, d]. If a direction is missing, the model is not
+    fully linear. The second return value is None if no direction is missing.
     """
     offset = (points.unit - points.unit[best]) / radius
     distance = np.linalg.norm(offset, axis=1)
@@ -167,13 +169,13 @@ def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDA
             if len(chosen) == offset.shape[1]:
                 return chosen, missing
         if missing is None:
-            # The orthogonal complement of the directions that near points span.
+            # The orthogonal complement of the directions that nearby points span.
             missing = np.linalg.svd(basis)[2][len(basis) :] if len(basis) else np.eye(offset.shape[1])
     return chosen, missing
 
 
 def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> NDArray[np.int64]:
-    """Indices of the best point, the spanning points, and further points that determine the curvature well.
+    """Indices of the best point, the spanning points, and further points that help to determine the curvature.
 
     There are at most 2 d + 1 points, as in Wild's experiments.
     """
@@ -191,7 +193,7 @@ def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> N
 def _pivot(offset: NDArray[np.float64]) -> float:
     """Smallest singular value of the quadratic kernel projected onto the complement of the linear functions."""
     plane = np.hstack([np.ones((len(offset), 1)), offset])
-    # Columns of q are weights of the points for which the weighted sum of every linear function is zero.
+    # Each column of q weights the points so that the weighted sum of every linear function is zero.
     q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
     return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])
 

@@ -1,10 +1,9 @@
 """Projected Levenberg-Marquardt from many starting points in parallel, for least-squares problems in the unit cube.
 
 A step minimizes the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
-divided by the number of residuals. Components that would leave the cube are fixed at the face of the cube. The system
-is then solved again for the other components, until no component leaves the cube. The damping mu is updated from the
-gain ratio as in H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of
-Denmark).
+divided by the number of residuals. Components that would leave the cube are fixed at its faces. The system is solved
+again for the other components until no component leaves the cube. The damping mu is updated from the gain ratio as in
+H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
 
 `descend` is a generator, so the caller decides how points are evaluated. `least_squares.py` calls the engine, and
 `descend_all` calls a model.
@@ -27,7 +26,7 @@ MERGE_DISTANCE = 1e-3
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Residuals [s, m] and their Jacobian with respect to unit-cube coordinates [s, m, d]. A row with a non-finite residual
-marks a failed evaluation.
+indicates a failed evaluation.
 """
 
 
@@ -42,7 +41,7 @@ class Starts:
         curvature: Gauss-Newton matrix H of the cost [s, d, d].
         damping: Damping mu [s].
         growth: Factor by which the next rejection increases the damping [s].
-        searches: Number of searches merged into each search, including itself [s].
+        searches: Number of searches [s] that each search represents: itself and those merged into it.
     """
 
     unit: NDArray[np.float64]
@@ -99,7 +98,7 @@ def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float6
         if not outside.any():
             break
         free &= ~outside
-    # Fixing groups of components is a heuristic, so the projected gradient step is the fallback. This step always
+    # Fixing groups of components is a heuristic, so a projected gradient step is the fallback. This step always
     # decreases the cost of the model, because the trace is at least the largest curvature in any direction.
     bound = np.trace(damped, axis1=1, axis2=2)[:, None]
     gradient_step = np.clip(-starts.gradient / bound, low, high)
@@ -132,13 +131,13 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 
 
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
-    """Merge searches that are close to a better search, because they would only reach the same minimum.
+    """Merge each search that is close to a better search into that search, because both would reach the same minimum.
 
     Returns the moving searches, the settled searches, and a mask of the moving searches that can be dropped [s]. The
     counts in `searches` include the merged searches.
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
-    # Ties are broken by index, so exactly one of two close searches is better.
+    # Ties are broken by index, so of any two searches exactly one is better.
     rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
     distance = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
     near = (distance < MERGE_DISTANCE) & (rank[None] < rank[number:, None])
@@ -160,12 +159,12 @@ def descend(
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
     """Search from all points [s, d] until each search has converged, joined a better search, or been abandoned.
 
-    Each search takes at most `iterations` steps. A search has converged if its model predicts a relative decrease in
-    cost, or a step, below `tolerance`. A search is abandoned if its cost exceeds the lowest cost by more than
-    `catch_up` times its predicted decrease. A search that comes close to the end of a better search in `earlier` is
-    merged with the better search. Only the `followed` starting points with the lowest costs are used; if `followed` is
-    None, all are used. The generator yields points to evaluate [s, d]. It returns the earlier searches, then the
-    searches that converged or were still moving at the end, and then the abandoned searches.
+    Each search takes at most `iterations` steps. A search has converged if its step, or the relative decrease in cost
+    that its model predicts, is at most `tolerance`. A search is abandoned if its cost exceeds the lowest cost by more
+    than `catch_up` times its predicted decrease. A search that comes close to the final point of a better search in
+    `earlier` is merged into the better search. Only the `followed` starting points with the lowest costs are used, or
+    all points if `followed` is None. The generator yields points to evaluate [s, d]. It returns the earlier searches,
+    then the searches that converged or were still moving at the end, and then the abandoned searches.
     """
     starts = begin(unit, (yield unit))
     # Searches do not start at failed evaluations.
@@ -209,7 +208,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep only the best of the searches that ended within `separation` of each other; the result is sorted by cost."""
+    """Keep only the best of any searches that ended within `separation` of each other; the result is sorted by cost."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

@@ -1,4 +1,4 @@
-"""The engine evaluations of a run, which are the only source of leaders, memories, surrogates and results."""
+"""The engine evaluations of a run, from which alone leaders, memories, surrogates and results are derived."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Function that maps residuals [n, m] to values [n]. The value must increase with the mean square of the residuals."""
 
 OBJECTIVE_TOLERANCE = 1e-4
-"""Maximum relative difference between a value and the objective of its residuals, which may be in single precision."""
+"""Maximum relative difference between a value and the objective computed from its residuals, which may be in single
+precision."""
 
 DECIMALS = 9
 """Number of decimals to which unit-cube coordinates are rounded before repeated points are merged."""
@@ -50,7 +51,7 @@ class Evaluations:
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """The residuals [n, m], for algorithms that use them."""
+        """The residuals [n, m], for algorithms that use residuals."""
         if self.residuals is None:
             raise InputError(
                 "residuals = None; this optimizer needs them: call tell(x, y, residuals=..., ...)"
@@ -59,7 +60,7 @@ class Evaluations:
 
     @property
     def slopes(self) -> NDArray[np.float64]:
-        """The derivatives of the residuals [n, m, d], for algorithms that use them."""
+        """The derivatives [n, m, d] of the residuals, for algorithms that use these derivatives."""
         if self.jacobian is None:
             raise InputError("jacobian = None; this optimizer needs it: call tell(x, y, jacobian=..., ...)")
         return self.jacobian
@@ -72,7 +73,7 @@ class Evaluations:
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
-        """Concatenate one or more sets of evaluations with the same optional parts."""
+        """Concatenate one or more sets of evaluations, all with the same optional parts."""
 
         def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
             present = [array for array in arrays if array is not None]
@@ -133,7 +134,7 @@ class Archive:
         return float(root_mean_square(self.leading.errors)[0]) if succeeded else np.inf
 
     def all(self) -> Evaluations:
-        """All evaluations so far in the order of `tell`, without Jacobians.
+        """All evaluations so far, without Jacobians, in the order in which `tell` received them.
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.
@@ -144,7 +145,7 @@ class Archive:
         return self._parts[0]
 
     def leaders(self, count: int) -> NDArray[np.float64]:
-        """The best distinct points of the whole run [count, d], best first, with ties in the order of `tell`.
+        """The best distinct points [count, d] of the whole run, best first; ties are in the order of `tell`.
 
         If there are fewer than `count` points, the last point is repeated.
         """
@@ -183,7 +184,7 @@ def checked_evaluations(
 ) -> Evaluations:
     """Validate and copy evaluations: points x [n, d], values y [n], and the residuals and the Jacobian in `parts`.
 
-    A value of +inf marks a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer
+    A value of +inf indicates a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer
     does not use are checked and dropped. Values are compared with the objective of the residuals unless `objective` is
     None.
 
@@ -232,7 +233,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
     """Check that values increase with the mean square of residuals, for new evaluations and the best evaluation so far.
 
     Raises:
-        InputError: An evaluation has a lower value than another evaluation, but a higher mean square.
+        InputError: An evaluation has a lower value but a higher mean square than another evaluation.
     """
     if len(archive):
         without_jacobian = Evaluations(evaluations.x, evaluations.y, evaluations.residuals)
@@ -241,7 +242,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
     size = root_mean_square(evaluations.errors)
     order = np.argsort(size, kind="stable")
     value, size = evaluations.y[order], size[order]
-    # If evaluations are sorted by mean square, no value may be below an earlier value.
+    # In order of mean square, no value may be below an earlier value.
     highest = np.maximum.accumulate(value)
     slack = OBJECTIVE_TOLERANCE * np.abs(value) + 1e-9
     for row in np.flatnonzero(highest > value + slack):

@@ -82,7 +82,7 @@ class GaussianProcess(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
         promise = log_improvement(model, candidates, best)
-        # Draw candidates at decreasing distances from the best candidate so far.
+        # Draw candidates at ever shorter distances from the best candidate so far.
         for reach in (0.1, 0.01, 0.001):
             closer = reach * self._rng.standard_normal((CANDIDATES // 3, d))
             closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)
@@ -93,7 +93,7 @@ class GaussianProcess(Optimizer):
 
 
 def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """Logarithm of the expected improvement over the best value [k] at points x [k, d]."""
+    """Logarithm [k] of the expected improvement over the best value at the points x [k, d]."""
     mean, share = model.predict(x)
     spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
     z = (best - mean[:, 0]) / spread
@@ -101,7 +101,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), which is accurate even for tiny values; z [k] is in standard deviations.
+    """The logarithm of phi(z) + z Phi(z), accurate even if this sum is tiny; z [k] is in standard deviations.
 
     Example:
         >>> import numpy as np

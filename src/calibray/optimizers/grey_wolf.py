@@ -7,11 +7,11 @@ descriptions and common implementations differ, the following choices apply:
   after the last evaluation is omitted, so a run takes exactly N T evaluations.
 - alpha, beta and delta are the three best *distinct* points of the whole run (not of the last generation), with ties in
   the order of evaluation. Wolves at the same point count as one leader.
-- Wolves always move, even to a worse position.
+- Wolves always move, even if the new position is worse.
 - Positions outside the bounds are clipped to the bounds before evaluation.
 - A failed evaluation (+inf) ranks last and has no other effect.
-- C multiplies a position, so steps are short near the origin of the coordinates and long far from the origin. As in the
-  published method, the pack is therefore biased towards the origin.
+- C multiplies a position, so steps are short near the origin of the coordinates and long far from the origin. The pack
+  is therefore biased towards the origin, as in the published method.
 
 SGWO-IM, the Surrogate-assisted Grey Wolf Optimizer with Individual Memory: X. Zou, P. Tang, P. Liu, C. Tai, "Efficient
 and Accurate Surrogate-Assisted Electromagnetic Parameter Calibration for 6G Digital Twin Channels", Algorithm 1 and
@@ -21,8 +21,8 @@ evaluations.
 
 Where the paper is silent, the following choices apply, in addition to those for GWO:
 
-- "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real evaluations
-  of the run, including those that were not requested.
+- "RBF model is available" means t > `full_iterations`. In every iteration, the model is refitted to all real
+  evaluations of the run, including those that were not requested.
 - Wolves that the surrogate does not select still move. Only real evaluations change the memory of a wolf.
 - Each memory starts at the initial position with a score of infinity, and is replaced only by an evaluation with a
   strictly lower score.
@@ -35,7 +35,7 @@ With `w_min = w_max = 0`, linear convergence and no surrogate, SGWO-IM gives the
 
 The surrogate is SciPy's `RBFInterpolator` with a cubic kernel, a linear tail, inputs scaled to the unit cube and
 smoothing 1e-6. Repeated points are merged, and their objectives are averaged. A failed evaluation is assigned the worst
-successful value, so that the model avoids the failed point and contains no infinite value.
+successful value, so that the model avoids the failed point and is fitted to finite values only.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ WOLVES = 30
 """Number of wolves, N in the paper (Table II)."""
 
 LEAST_BUDGET = 24
-"""Smallest budget of both methods. SGWO-IM then has three wolves, one for each leader, and uses the whole budget."""
+"""Smallest budget of both methods. With this budget, SGWO-IM has three wolves, one for each leader, and uses the whole
+budget."""
 
 FULL_ITERATIONS = 5
 """Number of iterations that evaluate all wolves (Table II)."""
@@ -95,7 +96,7 @@ def encircle(
 
 
 def whole_iterations(budget: int) -> dict[str, int]:
-    """The settings of GWO for a budget: 30 wolves, and as many complete iterations as the budget allows.
+    """The settings of GWO for a given budget: 30 wolves, and as many complete iterations as the budget allows.
 
     If the budget does not allow two iterations of 30 wolves, there are fewer wolves.
 
@@ -174,7 +175,7 @@ CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
 
 
 def screened_iterations(budget: int) -> dict[str, int]:
-    """The settings of SGWO-IM for a budget: the paper's schedule for 225 evaluations, scaled for other budgets.
+    """The settings of SGWO-IM for a given budget: the paper's schedule (225 evaluations), scaled if the budget differs.
 
     At most two thirds of the budget are spent on 5 full iterations of at most 30 wolves. The rest is spent on
     iterations of at most 5 elites.
@@ -201,7 +202,8 @@ class SGWOIM(Optimizer):
         w_min: Memory weight at the start of the run.
         w_max: Memory weight at the end of the run.
         convergence: "cosine" (the paper's eq. 2) or "linear" (standard GWO).
-        surrogate: Whether the surrogate selects wolves; if not, every iteration evaluates the whole population.
+        surrogate: Whether the surrogate selects the wolves to evaluate; if not, every iteration evaluates the whole
+            population.
 
     Raises:
         InputError: An argument is out of range.
@@ -286,7 +288,7 @@ class SGWOIM(Optimizer):
 
 
 def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations) -> Evaluations:
-    """Update the memory of each evaluated wolf whose answer has a strictly lower score."""
+    """Update the memory of each evaluated wolf whose new score is strictly lower than the remembered score."""
     x, y = memory.x.copy(), memory.y.copy()
     better = answers.y < y[wolves]
     x[wolves[better]], y[wolves[better]] = answers.x[better], answers.y[better]
@@ -296,7 +298,7 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
 def predict(archive: Archive, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
     """Predict the objective at candidates [n, d] from all real evaluations; zero if all evaluations failed.
 
-    The archive must contain more than d distinct points that span the box.
+    The archive must contain at least d + 1 distinct points that span the box.
     """
     if not np.isfinite(archive.best.y):
         return np.zeros(len(candidates))

@@ -1,23 +1,24 @@
-"""Multi-start least squares with exact derivatives: projected Levenberg-Marquardt from all starts in parallel.
+"""Multi-start least squares with exact derivatives: projected Levenberg-Marquardt from many points in parallel.
 
 Local searches are cheap if the engine returns derivatives, and a batch of candidates takes little longer than one
 candidate. Many searches therefore run in parallel, and each `ask` returns the next trial point of every search still in
 progress. Because of slab resonances, RMSE is a multimodal function of the permittivities, so one starting point is not
-enough. A search that comes close to a better search is merged with the better search. A search that cannot catch up
-with the best search is abandoned, and its last point is kept as another minimum (`minima`). Minima that fit nearly as
-well show how ambiguous the best minimum is. `descent.py` computes the steps.
+enough. A search that comes close to a better search is merged into the better search. A search that cannot catch up
+with the best search is abandoned, and its last point is kept among the minima (`minima`). Other minima that fit nearly
+as well as the best one show how ambiguous the solution is. `descent.py` computes the steps.
 
 Starting points are used in rounds, until `RETURNS` searches have ended in the best minimum. If there is a better
 minimum with an equally wide basin, the probability that all searches have missed this minimum is e^-k after k returns
 to the best minimum. If fewer searches end in the best minimum, all starting points are used. (The Bayesian rule of
-Boender and Rinnooy Kan, Mathematical Programming 37, 1987, counts the different minima, which requires every search to
-run to its end.)
+Boender and Rinnooy Kan, Mathematical Programming 37, 1987, counts the different minima, and therefore requires every
+search to run to its end.)
 
 If too few searches have ended in the best minimum, minima are combined into new starting points (`recombine`). Searches
 start from the combinations that fit best, until no better minimum is found. If there is at least one full round of
 starting points, basin hopping follows (Wales and Doye, Journal of Physical Chemistry A 101, 1997): searches start from
-the best minimum with one or two coordinates redrawn. A resonating slab causes repeated minima along the coordinate of
-its material, and materials act nearly independently. A lower minimum therefore often differs in only a few coordinates.
+copies of the best minimum in which one or two coordinates are redrawn. A resonating slab causes repeated minima along
+the coordinate of its material, and the effects of different materials are nearly independent. A lower minimum therefore
+often differs in only a few coordinates.
 """
 
 from __future__ import annotations
@@ -41,14 +42,14 @@ CATCH_UP = 100.0
 """A search is abandoned if its cost exceeds the lowest cost by more than this multiple of its predicted decrease."""
 
 NEARER = 10.0
-"""Value of `CATCH_UP` for searches from combined minima, which start close to the minima that they reach."""
+"""Value that replaces `CATCH_UP` for searches from combined minima, which start close to the minima that they reach."""
 
 COMBINATIONS = 32
-"""Maximum number of combinations of minima tried at a time; the number of starting points is another limit.
+"""Maximum number of combinations of minima per round, which is also limited by the number of starting points.
 """
 
 FOLLOWED = 0.2
-"""Fraction of the combinations, the best-fitting ones, from which searches start."""
+"""Fraction of the combinations from which searches start; the combinations that fit best are chosen."""
 
 PARENTS = 12
 """Number of minima that are combined, starting from the lowest."""
@@ -64,8 +65,8 @@ HOPS = 8
 
 PATIENCE = 6
 """Number of successive rounds without a lower minimum after which basin hopping ends. In 24 development problems that
-use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine runs with 3, and two
-runs with 6.
+use all starting points, 14 runs ended above the lowest known minimum with a patience of 0, nine with a patience of 3,
+and two with a patience of 6.
 """
 
 RETURNS = 10
@@ -75,10 +76,11 @@ LEVEL = 1e-4
 """Relative difference in mean square below which two minima, for example along a valley, fit equally well."""
 
 NOISELESS = 1e-9
-"""Fraction of the largest mean square added to the tolerance of `LEVEL`, for rounding errors in noiseless problems."""
+"""Fraction of the largest mean square that is added to the tolerance `LEVEL`, to allow for rounding errors in noiseless
+problems."""
 
 APART = 0.01
-"""Distance in the unit cube below which two searches have ended in the same minimum."""
+"""Distance in the unit cube below which two searches are considered to have ended in the same minimum."""
 
 
 @final
@@ -93,11 +95,11 @@ class LeastSquares(Optimizer):
             point.
         x0: Further starting points, [d] or [k, d].
         iterations: Maximum number of steps of each search.
-        tolerance: A search has converged if its model predicts a relative decrease in mean square below this tolerance,
-            or a step shorter than the tolerance in the unit cube.
+        tolerance: A search has converged if its step in the unit cube, or the relative decrease in mean square that its
+            model predicts, is at most this tolerance.
         catch_up: A search is abandoned if its cost exceeds the lowest cost by more than this multiple of its predicted
-            decrease. Use a smaller number if some starting points are already minima, and the other points only check
-            for a better minimum.
+            decrease. Use a smaller multiple if some starting points are already minima and the other points serve only
+            to check for a better minimum.
 
     Raises:
         InputError: An argument is out of range.
@@ -164,7 +166,7 @@ class LeastSquares(Optimizer):
         number, before = min(COMBINATIONS, self.starts), np.inf
         followed = round(FOLLOWED * number)
         while followed and ended.cost.min() < before:
-            # A lower minimum must have a cost below this value.
+            # Only a minimum with a cost below this value counts as lower.
             before = ended.cost.min() - _slack(ended)
             unit = recombine(distinct(ended, SPACE).unit, number)
             if not len(unit):
@@ -207,19 +209,20 @@ def returns(ended: Starts) -> int:
 def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
     """Combine minima [k, d], best first, into at most `number` points from which searches can reach other minima.
 
-    The best minimum is shifted by the difference between two minima, or one of its coordinates is replaced with that of
+    The best minimum is shifted by the difference between two minima, or one of its coordinates is replaced by that of
     another minimum. Shifts help because a single cause, such as a resonating slab, repeats minima at equal distances,
     regardless of the other parameters. Shifts correspond to mutation in differential evolution (Storn and Price,
-    Journal of Global Optimization 11, 1997), and exchanges correspond to crossover. Exchanges help if parameters act
-    nearly independently, such as the parameters of materials that rarely occur on the same path. Points within `SPACE`
-    of a minimum are excluded. Shifts and exchanges alternate, starting with those of the lowest minima.
+    Journal of Global Optimization 11, 1997), and exchanges correspond to crossover. Exchanges help if the effects of
+    parameters are nearly independent, as for materials that rarely occur on the same path. Points within `SPACE` of a
+    minimum are excluded. Shifts and exchanges alternate, starting with those of the lowest minima.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))
     # Pairs of the lowest minima come first.
     order = np.lexsort((target + source, np.maximum(target, source)))
     shifted = best + (low[target] - low[source])[order]
-    # The best minimum takes each coordinate of each other minimum in turn.
+    # One coordinate of the best minimum is replaced by that of another minimum, for each coordinate and minimum in
+    # turn.
     exchanged = np.where(np.eye(dimension, dtype=bool), low[1:, None], best).reshape(-1, dimension)
     new = [_new(points, minima) for points in (shifted, exchanged)]
     turn = np.argsort(np.concatenate([np.arange(len(points)) for points in new]), kind="stable")
@@ -233,7 +236,7 @@ def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
 
 
 def hops(best: NDArray[np.float64], number: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Copy a point of the unit cube [d]; one or two coordinates of each copy [number, d] are redrawn at random."""
+    """Copy a point [d] of the unit cube; in each copy [number, d], one or two coordinates are redrawn at random."""
     points = np.repeat(best[None], number, axis=0)
     for point in points:
         count = min(len(best), random.integers(1, 3))

@@ -4,16 +4,16 @@
   search starts in the middle of the unit cube with a step size of 0.3.
 - DFO-LS, from the authors' package: C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and
   Robustness of Model-Based Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32. DFO-LS is a
-  local method, which fits a linear model to every residual in a trust region, one evaluation at a time.
+  local method: in a trust region, it fits a linear model to every residual, one evaluation at a time.
 - Differential evolution: R. Storn, K. Price, J. Global Optim. 11 (1997) 341. Each batch is one generation. SciPy's
-  final polish, which would need derivatives, is omitted.
+  final polishing step, which would need derivatives, is omitted.
 
 All methods start at the best point already passed to `tell`, if any. If a search converges before the budget is used
 up, the method restarts from a random point or population.
 
 A minimizer that calls its objective runs in a separate thread, and waits in the objective for the evaluation. Only
 one of the two threads runs at a time, so a run is as reproducible as the library itself. If a search is dropped before
-its end, the objective raises an exception inside the library, which ends the thread.
+its end, the objective raises an exception inside the library; this exception ends the thread.
 """
 
 from __future__ import annotations

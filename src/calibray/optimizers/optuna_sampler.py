@@ -1,13 +1,13 @@
 """SGWO-IM as a sampler for Optuna, for use with Optuna's storages, dashboard and workers.
 
-Every candidate is stored in the trial that receives it. If a new sampler with the same seed is used on a stored study,
-it therefore repeats the same candidates, uses the stored answers, and continues where the study stopped. Trials that
-the sampler did not propose, such as enqueued trials or trials of another sampler, are added to the archive and can
-become leaders of the pack. A failed trial is treated as a failed evaluation.
+Every candidate is stored in the trial that receives it. A new sampler with the same seed can therefore resume a stored
+study: it generates the same candidates again, uses the stored answers, and continues where the study stopped. Trials
+that the sampler did not propose, such as enqueued trials or the trials of another sampler, are added to the archive and
+can become leaders of the pack. A failed trial is treated as a failed evaluation.
 
-The pack cannot move before the iteration is complete. If every open candidate is being evaluated, a candidate that
-another process is evaluating is returned again, because that process might have ended. If no other process is
-evaluating a candidate, the trial is a random point.
+The pack cannot move before all candidates of an iteration are evaluated. If every open candidate is under evaluation,
+one that another process is evaluating is returned again, because that process might have ended. If no other process is
+evaluating a candidate, the trial evaluates a random point.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class SGWOIMSampler(BaseSampler):
     def after_trial(
         self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """Record a trial's answer, and stop the study after the last iteration."""
+        """Record the answer of a trial, and stop the study after the last iteration."""
         with self._lock:
             if self._optimizer is None:
                 return
@@ -159,7 +159,7 @@ class SGWOIMSampler(BaseSampler):
         state: TrialState,
         values: Sequence[float] | None,
     ) -> None:
-        """Pass a finished trial to the optimizer, unless the trial was already passed."""
+        """Pass a finished trial to the optimizer, unless the optimizer has already received it."""
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)
@@ -183,7 +183,7 @@ class SGWOIMSampler(BaseSampler):
 
 
 def _bounds(distribution: Numeric) -> tuple[float, float]:
-    """Bounds of the search coordinate; each value on a grid covers an interval one step wide."""
+    """Bounds of the search coordinate; each value on a grid corresponds to an interval one step wide."""
     margin = 0.5 * (distribution.step or 0.0)
     return _coordinate(distribution, distribution.low - margin), _coordinate(
         distribution, distribution.high + margin

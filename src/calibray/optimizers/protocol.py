@@ -1,8 +1,9 @@
-"""Interfaces of optimizers (`ask` returns candidates, `tell` receives their evaluations) and optional cheap models.
+"""Interfaces of optimizers (`ask` returns candidates, `tell` receives their evaluations) and of optional cheap models.
 
 An algorithm is a generator that yields the candidates [n, d] of each iteration and receives their evaluations, so that
-its code can follow the paper. A `Session` suspends the algorithm between `ask` and `tell`, checks the evaluations,
-keeps the archive, and collects the answers to a batch. Answers can arrive in any order and in several calls.
+its code can follow the publication that describes it. A `Session` suspends the algorithm between `ask` and `tell`,
+checks the evaluations, keeps the archive, and collects the answers to a batch. Answers can arrive in any order and in
+several calls.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Session:
         box: The search box.
         uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
         search: Function that starts the algorithm with the archive; the algorithm does not run before the first `ask`.
-        objective: Function that converts residuals to the value, if residuals are used.
+        objective: Function that converts residuals to the value; applies only if the algorithm uses residuals.
 
     Attributes:
         minima: Distinct minima that the algorithm keeps, lowest first [k, d]; empty until the algorithm sets them.
@@ -65,7 +66,7 @@ class Session:
 
     @property
     def done(self) -> bool:
-        """Whether the algorithm has ended; if necessary, the next candidates are computed to determine this."""
+        """Whether the algorithm has ended; if necessary, the next candidates are computed to find out."""
         # The algorithm does not start before the first `ask`, so that `tell` can still receive earlier evaluations.
         if self._asked is not None:
             self._advance()
@@ -103,7 +104,7 @@ class Session:
         self.archive.add(evaluations)
         if self._asked is None:
             return
-        # If the whole batch arrives in the requested order, points need not be matched individually.
+        # If the whole batch arrives in the requested order, its points need not be matched individually.
         if np.array_equal(evaluations.x, self._asked) and len(self._open) == len(self._asked):
             self._answers, self._open = {0: evaluations}, self._open[:0]
             return
@@ -142,7 +143,7 @@ def limited(search: Search, budget: int) -> Search:
 
 
 def first_start(archive: Archive) -> NDArray[np.float64]:
-    """Starting point [d] of a local search in the unit cube: the best point passed to `tell`, or else the middle."""
+    """Starting point [d] of a local search in the unit cube: the best point passed to `tell`, or else the centre."""
     return archive.box.to_unit(archive.best.x) if len(archive) else np.full(archive.box.dimension, 0.5)
 
 
@@ -152,7 +153,7 @@ class Schedule:
 
     Attributes:
         settings: Function that maps a budget of evaluations to constructor arguments that respect the budget.
-        least: Smallest budget with which the method can run.
+        least: Smallest budget that the method accepts.
     """
 
     settings: Callable[[int], dict[str, int]]
@@ -160,7 +161,7 @@ class Schedule:
 
 
 AS_GIVEN: Final = Schedule(lambda budget: {"budget": budget})
-"""The schedule of a method that accepts any budget as its setting `budget`."""
+"""The schedule of a method whose setting `budget` accepts any budget."""
 
 
 class Optimizer(ABC):
@@ -172,7 +173,8 @@ class Optimizer(ABC):
 
     The value can be any number, such as an error or a negative log likelihood. A method that uses residuals minimizes
     their mean square, so the value must increase with the mean square. For a likelihood, pass deviance residuals
-    sign(r) sqrt(2 (l(r) - l(0))) to `tell`, where r are residuals with negative log likelihood l.
+    sign(r) sqrt(2 (l(r) - l(0))) to `tell`, where r are the residuals and l is the negative log likelihood of a
+    residual.
 
     Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, the seed of the random generator. If
     residuals are used, the constructor also takes `objective`, a function that maps residuals [n, m] to the value [n];
@@ -234,7 +236,8 @@ class Optimizer(ABC):
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """The best point, followed by the distinct minima that the method keeps [k, d]; the best point can occur twice.
+        """The best point, followed by the distinct minima that the method keeps; shape [k, d]. The best point can occur
+        twice.
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.
@@ -264,9 +267,9 @@ class Optimizer(ABC):
         """Pass evaluations to the optimizer; all arrays are copied.
 
         Requested candidates can be passed in any order and in several calls; the search continues when the batch is
-        complete. Points that were not requested, such as points of an earlier run, are added to the archive. These
-        points can become the best point, a leader or data for a surrogate, but are not treated as answers to
-        candidates.
+        complete. Points that were not requested, such as points of an earlier run, are added to the archive. Such a
+        point can become the best point or a leader, and surrogates are fitted to it, but it does not count as the
+        answer to a candidate.
 
         Args:
             x: Points [n, d] inside the bounds.
@@ -283,7 +286,7 @@ class Optimizer(ABC):
 
 
 class CheapAnswer(NamedTuple):
-    """The output of a cheap model at n points, each with its own set of constants.
+    """The output of a cheap model at n points, each evaluated with its own set of constants.
 
     Attributes:
         residuals: Residuals, in the order of the engine's residuals [n, m].
@@ -298,7 +301,7 @@ class CheapAnswer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """Constants of a cheap model that may be wrong and that the search does not change.
+    """Constants of a cheap model that may be wrong and that are not search parameters.
 
     Attributes:
         centre: Assumed values [q]; q can be 0.
@@ -337,7 +340,7 @@ class CheapModel(Protocol):
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Mask of the residuals that the model predicts [m]; other residuals are arbitrary constants."""
+        """Mask [m] of the residuals that the model predicts; the other residuals are arbitrary constants."""
         ...
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:

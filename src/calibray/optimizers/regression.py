@@ -7,18 +7,18 @@ model, h(x) is its response at x. v_0 allows for an offset, v_1 for a change in 
 remainder. All residuals share K, so a single factorization suffices for any number of residuals. With a linear trend,
 the coefficients of 1 and x are unknown and have no prior (universal kriging).
 
-One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal contrasts, for which
-the trend vanishes; without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T replaces
+One derivation covers regression with and without a trend. The columns of C [n, f] are orthonormal contrasts, which
+eliminate the trend; without a trend, C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T replaces
 K^-1.
 
 C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
 2.42, 4.17, 5.9 and sec. 9.9; closed-form leave-one-out errors: S. Rippa, Adv. Comput. Math. 11 (1999) 193.
 
-`Kriging` interpolates all residuals with length scales that are estimated from the residuals. Every residual is a
+`Kriging` interpolates all residuals; it estimates the length scales from the residuals. Every residual is a
 linear trend plus a weighted sum of Matern-5/2 functions centred at the evaluated points. All residuals share the input
-scales. There is one scale per parameter, so a parameter without influence drops out. The scales maximize the restricted
-log likelihood summed over all residuals. With tens of links, a dozen points determine these scales well. The variance
-of each residual is profiled out.
+scales. There is one scale per parameter, so a parameter without influence is effectively ignored. The scales maximize
+the restricted log likelihood summed over all residuals. With tens of links, a dozen points determine these scales well.
+The variance of each residual is profiled out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 SINGULAR = 1e10
-"""Value of the negative log likelihood if the kernel matrix cannot be factorized."""
+"""Value that replaces the negative log likelihood if the kernel matrix cannot be factorized."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Inputs:
 
     @staticmethod
     def plain(unit: NDArray[np.float64]) -> Inputs:
-        """Points of the unit cube [n, d] without a cheap model."""
+        """Points [n, d] of the unit cube, without a cheap model."""
         return Inputs(unit, np.zeros((len(unit), 0)))
 
 
@@ -61,7 +61,7 @@ class Kernel:
     Attributes:
         variances: v_0, v_1 and v_2.
         rates: Inverse length scales [d].
-        nugget: Variance of independent errors at the points.
+        nugget: Variance of independent errors of the values at the points.
     """
 
     variances: NDArray[np.float64]
@@ -70,7 +70,7 @@ class Kernel:
 
     @staticmethod
     def of(hyper: NDArray[np.float64], scale: float = 1.0) -> Kernel:
-        """Make a kernel from the logarithms [3 + d + 1] of v_0, v_1, v_2, the rates [d] and the nugget.
+        """Create a kernel from the logarithms [3 + d + 1] of v_0, v_1, v_2, the rates [d] and the nugget.
 
         The variances and the nugget are multiplied by `scale` squared.
         """
@@ -92,15 +92,15 @@ class Kernel:
         return self.variances[0] + self.variances[1] * a.response @ b.response.T + self.variances[2] * smooth
 
     def variance(self, at: Inputs) -> NDArray[np.float64]:
-        """Prior variance at points [k], without the nugget."""
+        """Prior variance [k] at points, without the nugget."""
         return self.variances[0] + self.variances[1] * np.sum(at.response**2, axis=1) + self.variances[2]
 
     def matrix(self, at: Inputs) -> NDArray[np.float64]:
-        """Covariance matrix K of points [n, n], with the nugget."""
+        """Covariance matrix K [n, n] of points, with the nugget."""
         return self.covariance(at, at) + self.nugget * np.eye(len(at.unit))
 
     def distance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
-        """Distances between points [k, n], in units of the length scales."""
+        """Distances [k, n] between points, in units of the length scales."""
         return np.asarray(cdist(a.unit * self.rates, b.unit * self.rates), dtype=np.float64)
 
 
@@ -155,12 +155,13 @@ class Process:
 
     @property
     def precision(self) -> NDArray[np.float64]:
-        """Inverse of the factor by which K is multiplied to give the covariance of each residual [m]."""
+        """Inverse of the factor [m] by which K is multiplied to give the covariance of each residual."""
         return _precision(len(self.whitened), np.sum(self.whitened**2, axis=0), self.freedom)
 
     @property
     def root(self) -> NDArray[np.float64]:
-        """Factor B of the covariance B^T B between residuals, relative to K: [f, m], or [f + m, m] with a prior."""
+        """Factor B of the covariance B^T B between residuals, relative to K; shape [f, m], or [f + m, m] with a
+        prior."""
         rows = self.whitened
         if self.freedom:
             rows = np.vstack([rows, np.sqrt(self.freedom) * np.eye(rows.shape[1])])
@@ -209,7 +210,7 @@ class Process:
         return self.weights / self.inverse_diagonal[:, None]
 
     def _whiten(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Whiten columns of values at the points [n, k], and return them as [f, k]."""
+        """Whiten columns of values at the points [n, k]; the result has the shape [f, k]."""
         return solve_triangular(self.lower, self.trend.contrasts.T @ columns, lower=True)
 
 
@@ -244,8 +245,8 @@ class Likelihood:
     def __call__(self, kernel: Kernel) -> tuple[float, NDArray[np.float64]]:
         """Return the value and its gradient [3 + d + 1].
 
-        The gradient is with respect to the logarithms of v_0, v_1, v_2, the rates and the nugget. If the kernel
-        matrix cannot be factorized, the value is `SINGULAR` and the gradient is zero.
+        The gradient is with respect to the logarithms of v_0, v_1, v_2, the rates and the nugget. If the kernel matrix
+        cannot be factorized, the value is `SINGULAR`, and the gradient is zero.
         """
         count, residuals = self.values.shape
         rates_squared = kernel.rates**2
@@ -304,7 +305,7 @@ def most_probable(
 
     The variances and the nugget are multiplied by `scale` squared. The negative log density is divided by `divisor`,
     which determines the size of the first step. Searches of at most `steps` steps start at the mean of the prior and,
-    if given, at `guess`, such as the kernel of an earlier fit.
+    if given, at `guess`, for example the kernel of an earlier fit.
     """
     held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
 
@@ -405,10 +406,10 @@ def fit(
     noisy: bool = False,
     guess: Kernel | None = None,
 ) -> Kriging:
-    """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
+    """Fit a model and its input scales to residuals [n, m] at distinct points [n, d] of the unit cube.
 
-    There must be at least d + 2 points that span the cube. If `noisy` is true, the engine's answers are noisy, so the
-    nugget is also estimated; otherwise, the model interpolates. `guess` is an additional starting point of the kernel
+    There must be at least d + 2 points that span the cube. If the engine's answers are `noisy`, the nugget is also
+    estimated; otherwise, the model interpolates the answers. `guess` is an additional starting point of the kernel
     search.
     """
     spread = residuals.std(axis=0)
@@ -424,12 +425,12 @@ def fit(
 
 
 def likelihood(unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Likelihood:
-    """The restricted likelihood of kernels, given residuals [n, m] at points of the unit cube [n, d]."""
+    """The restricted likelihood of kernels, given residuals [n, m] at points [n, d] of the unit cube."""
     return Likelihood(Inputs.plain(unit), residuals, linear=True)
 
 
 def solve(unit: NDArray[np.float64], residuals: NDArray[np.float64], kernel: Kernel) -> Kriging:
-    """Build the model with a given kernel from residuals [n, m] at points of the unit cube [n, d]."""
+    """Build the model with a given kernel from residuals [n, m] at points [n, d] of the unit cube."""
     process = condition(Inputs.plain(unit), residuals, kernel, linear=True)
     return Kriging(process, process.root)
 

@@ -29,7 +29,8 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
-    # If SciPy is interrupted while reading direction numbers, it ignores the interruption and continues without them.
+    # If SciPy is interrupted while reading the direction numbers, it ignores the interruption and continues without
+    # these numbers.
     with defer_interruption():
         sequence = qmc.Sobol(dimension, rng=rng)
     # Sobol points are balanced only in blocks of a power of two, and SciPy warns about other block sizes.
@@ -39,7 +40,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """Draw `tries` Latin hypercubes [count, dimension], and return the one with the largest minimum spacing."""
+    """Draw `tries` Latin hypercubes [count, dimension], and return the one whose points are the farthest apart."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -48,7 +49,7 @@ def maximin_design(
 def draw_around(
     points: NDArray[np.float64], count: int, log_reach: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw points [count, d] around given points of the unit cube [n, d], at distances of various orders of magnitude.
+    """Draw points [count, d] around given points [n, d] of the unit cube, at distances of various orders of magnitude.
 
     The standard deviation of each point's offset is log-uniform from 10^`log_reach` to 10^-0.5.
     """
@@ -69,7 +70,7 @@ def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> 
 def not_evaluated(
     candidates: NDArray[np.float64], points: NDArray[np.float64], separation: float
 ) -> NDArray[np.float64]:
-    """The candidates [k, d] farther than `separation` from all evaluated points [n, d]; if none, the farthest one."""
+    """The candidates [k, d] farther than `separation` from all `points` [n, d]; if there are none, the farthest one."""
     distance = distance_to_nearest(candidates, points)
     return candidates[distance > min(separation, np.nextafter(distance.max(), -np.inf))]
 

@@ -1,24 +1,25 @@
 """The vector surrogate models every residual instead of the root mean square, and searches this model globally.
 
-The objective is a sum over links, so an evaluation that returns the residual of every link contains far more
-information than this sum. Residuals are smoother than the objective, and tens of residuals share a single kernel over
-the parameters (`regression.py`).
+The objective is a sum over links. An evaluation that returns the residual of every link therefore contains far more
+information than the objective alone. Residuals are smoother than the objective, and tens of residuals share a single
+kernel over the parameters (`regression.py`).
 
-A run begins with a maximin Latin hypercube. The design needs few points even for many parameters, because residuals can
-be modelled as soon as the points determine a linear trend. After the design, three kinds of steps alternate; the model
-is updated after every batch:
+A run begins with a maximin Latin hypercube. Even for many parameters, this design needs few points, because residuals
+can be modelled as soon as the points determine a linear trend. Three kinds of steps then alternate, and the model is
+updated after every batch:
 
 - *Exploration*: the point with the largest expected improvement in the mean square of the residuals, computed from
-  draws of the residuals (R. Astudillo, P. Frazier, ICML 2019). Assuming a normal distribution of the mean square
-  instead (D. R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to
-  impossibly low values. In many dimensions, this assumption would waste steps on the least explored corner of the box.
+  draws of the residuals (R. Astudillo, P. Frazier, ICML 2019). A normal distribution of the mean square (D. R. Jones,
+  M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) would give weight to impossibly low values and, in
+  many dimensions, waste steps on the least explored corners of the box.
 - *Exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
   searches with exact derivatives of the model.
 - *Another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that the
-  refinement of one basin does not prevent the exploration of the next.
+  refinement of one basin does not prevent the exploration of others.
 
-Input scales are estimated at every step up to `OFTEN` points, and afterwards whenever the number of points has grown by
-a tenth. Between these estimates, points are only added to the model, which saves most of the computing time.
+Input scales are estimated at every step until there are `OFTEN` points, and afterwards whenever the number of points
+has grown by a tenth. Between these estimates, the model receives new points but keeps its scales, which saves most of
+the computing time.
 
 In a batch, each candidate after the first is chosen as if the answers to the previous candidates had equalled the
 predictions. In the model, a failed evaluation has the residuals of the worst successful evaluation.
@@ -46,7 +47,7 @@ from calibray.optimizers.sampling import (
 )
 
 FIRST = 5
-"""Maximum difference between the number of points in the initial design and the number of parameters."""
+"""Maximum number of points by which the initial design exceeds the number of parameters."""
 
 CANDIDATES = 600
 """Number of candidates drawn over the whole box, and also the number drawn around the best points."""
@@ -64,7 +65,8 @@ SEARCHES = 16
 """Number of local searches on the model."""
 
 UNCERTAIN = 1e-3
-"""A predicted minimum is treated as another basin if its variance exceeds this fraction of the prior variance."""
+"""A predicted minimum counts as another basin if the predictive variance there exceeds this fraction of the prior
+variance."""
 
 
 @final
@@ -155,7 +157,7 @@ class VectorSurrogate(Optimizer):
         return points
 
     def _fitted(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> Kriging:
-        """Fit a model to all points; the scales are estimated again if the number of points has grown enough."""
+        """Fit a model to all points; estimate the scales again if the number of points has grown enough."""
         if self._model is None:
             self._learned = len(points)
             return fit(points, residuals, noisy=self.noisy)
@@ -195,7 +197,7 @@ class VectorSurrogate(Optimizer):
         around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
         candidates = not_evaluated(candidates, taken, SEPARATION)
-        # Multiplied by `root`, these draws have the covariance of the residuals.
+        # Multiplied by `root`, these draws have the covariance between residuals.
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
         mean, share = model.predict(candidates)
         gain = improvement(mean, share, normal @ model.root, best)
@@ -208,9 +210,9 @@ class VectorSurrogate(Optimizer):
 def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Expectation and standard deviation [k] of the mean square Q of the residuals at points [k, d].
 
-    Let r be the prediction and s^2 V the predictive covariance. V is the prior covariance of the residuals, and s^2
+    Let r be the prediction and s^2 V the predictive covariance. V is the prior covariance between residuals, and s^2
     increases with the distance from evaluated points. Q then has the mean (r^T r + s^2 tr V) / m and the variance (4
-    s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of different links are correlated. If they were treated as independent,
+    s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of different links are correlated; if they were treated as independent,
     exploration would stop too early.
     """
     mean, share = model.predict(x)
@@ -236,6 +238,6 @@ def improvement(
 
 
 def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Find local minima [k, d] of the predicted objective, lowest first, from starting points [s, d]."""
+    """Find local minima [k, d] of the predicted objective, lowest first, by searches from starting points [s, d]."""
     ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
     return ends.unit[np.argsort(ends.cost, kind="stable")]

@@ -1,23 +1,24 @@
-"""Correction of a cheap model until it agrees with the engine: first its constants, then the remaining discrepancy.
+"""Correct a cheap model until it agrees with the engine: first the constants, then the remaining discrepancy.
 
 *Input mapping*: the constants of the cheap model are set to the values that best explain the engine's answers. Errors
 are whitened with the covariance of the discrepancy. For each link, the discrepancy is mostly an offset common to all
-points, so whitening prevents this offset from distorting the constants. The constants have a prior around their assumed
-values. This method is known as implicit space mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE
-Trans. Microw. Theory Tech. 52 (2004) 378).
+points, so whitening prevents this offset from distorting the constants. The prior of the constants is centred at their
+assumed values. This method is known as implicit space mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A.
+Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378).
 *Output mapping*: `discrepancy.py` models the offset, the slope and the remainder.
 
 Slab resonances cause many minima. A kernel that was fitted with wrong constants attributes the resulting errors to the
-discrepancy and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
-constants, most of which differ from the current set in one or two constants. Each set is compared at its most probable
-scale of the discrepancy. Rounds alternate between the fitted kernel and the kernel at the mean of the prior. In a
-round, local searches start from the most likely sets, and the kernel is fitted again for the best results. A result is
-accepted only if it makes the answers more probable.
+discrepancy, and therefore favours these constants. An input mapping therefore proceeds in rounds. A round tries many
+sets of constants, most of which differ from the current set in one or two constants. Sets are compared, each at its
+most probable scale of the discrepancy. Successive rounds use the fitted kernel and the kernel at the mean of the prior
+in turn. In each round, local searches start from the most likely sets, and the kernel is refitted for the best results.
+A result is accepted only if it makes the answers more probable.
 
-A few answers do not determine the constants of a cheap model. Several sets of constants explain the answers equally
-well but predict minima at different points. The lowest of these predictions would be too optimistic. Predictions are
-therefore averaged over ensemble members drawn from the posterior of the constants. Each member is corrected until it
-passes through all answers. The uncertainty is small where the members agree. Members are drawn by randomized maximum
+A few answers are not enough to determine the constants of a cheap model: several sets of constants explain the answers
+equally well, but predict minima at different points. The lowest of these predictions would be too optimistic.
+Predictions are therefore averaged over ensemble members drawn from the posterior of the constants. Each member is
+corrected until it passes through all answers. The uncertainty is small where the members agree. Members are drawn by
+randomized maximum
 likelihood: each member is fitted from a different starting point, to answers and a prior that are both perturbed
 according to their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is scaled
 according to the errors of earlier predictions at points that were not yet used in a fit.
@@ -54,7 +55,7 @@ FOLLOWED: Final = 4
 """Number of best-fitting sets from which the searches of a round start, in addition to the current set."""
 
 REFITTED: Final = 2
-"""Number of results of a round for which the kernel is fitted again."""
+"""Number of results of a round for which the kernel is refitted."""
 
 STEPS: Final = 12
 """Maximum number of steps of an input mapping from one starting point."""
@@ -89,10 +90,10 @@ class UnitModel:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Variation of the residuals of a cheap model over the box.
+    """Variation of a cheap model's residuals over the box.
 
     Attributes:
-        known: Mask of the residuals that the model predicts [m].
+        known: Mask [m] of the residuals that the model predicts.
         centre: Mean of the residuals over the box [m].
         scale: Root mean square of the deviations from this mean.
     """
@@ -103,13 +104,14 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """The response, given residuals [k, m] at points spread over the box; `known` [m] marks predicted columns."""
+        """The response, given residuals [k, m] at points spread over the box; `known` [m] marks the predicted
+        residuals."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
 
     def inputs(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Inputs:
-        """Points of the unit cube [k, d] and their responses, from the cheap model's residuals [k, m]."""
+        """Points [k, d] of the unit cube and their responses, computed from the cheap model's residuals [k, m]."""
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -157,7 +159,7 @@ class Corrected:
         return cheap + self.discrepancy.mean(inputs), slope + self.discrepancy.slope(inputs, response_slope)
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
-        """Residuals [k, m] of the cheap model with the adjusted constants, and the points with their responses."""
+        """Residuals [k, m] of the cheap model at the adjusted constants, and the points with their responses."""
         cheap = self.cheap.residuals(unit, self.constants)
         return cheap, self.response.inputs(unit, cheap)
 
@@ -173,14 +175,15 @@ class Corrected:
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
     def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
-        """Add a point in the unit cube [d] as if its evaluation had returned the given residuals [1, m]."""
+        """Add a point [d] in the unit cube as if its evaluation had returned the given residuals [1, m]."""
         unit, answers = np.vstack([self.unit, point]), np.vstack([self.residuals, residuals])
         cheap, inputs = self.base(unit)
         process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """The model with other constants [q] and a discrepancy through the same answers; None keeps the kernel."""
+        """The model with other constants [q], whose discrepancy passes through the same answers; None keeps the
+        kernel."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -196,10 +199,10 @@ def correct(
     noisy: bool = False,
     before: Corrected | None = None,
 ) -> Corrected:
-    """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
+    """Fit a corrected model to an engine's answers [n, m] at points [n, d] of the unit cube.
 
     The response of the cheap model is computed at the points in `cloud` [k, d]. The input mapping starts from the
-    constants of `before`, a model that was fitted to fewer points. `noisy` states whether the answers are noisy.
+    constants of `before`, a model that was fitted to fewer answers. `noisy` states whether the answers are noisy.
     """
 
     def corrected(constants: NDArray[np.float64], guess: Corrected | None) -> Corrected:
@@ -244,7 +247,7 @@ def with_discrepancy(
 
 
 def _own_misfit(corrected: Corrected) -> float:
-    """The misfit of a model's constants, computed with the model's own kernel."""
+    """The misfit of a model's constants, given the model's own kernel."""
     return float(misfit(corrected, corrected.constants[None]).value[0])
 
 
@@ -254,9 +257,9 @@ def constants_fit(
     """The least-squares problem for the constants, given a fixed covariance of the discrepancy.
 
     The prior is centred at `centre` [q], or at the centre of the cheap model's constants if `centre` is None. `noise`
-    [n m] perturbs the whitened answers. Returns a function that maps constants, which are scaled to the unit cube by
-    their bounds [s, q], to whitened errors and their Jacobian. Half the sum of squared errors is the negative log
-    density, up to a constant.
+    [n m] perturbs the whitened answers. Returns a function that maps constants [s, q], scaled to the unit cube by their
+    bounds, to whitened errors and their Jacobian. Half the sum of squared errors is the negative log density, up to an
+    additive constant.
     """
     model, process, prior = corrected.cheap.model, corrected.discrepancy, corrected.cheap.constants
     points, width = corrected.cheap.box.from_unit(corrected.unit), prior.width
@@ -286,8 +289,8 @@ class Misfit(NamedTuple):
     """Misfit of sets of constants to the answers.
 
     Attributes:
-        value: Negative log density of the answers and the constants, up to a constant [s].
-        scale: Factor for the variances of the discrepancy that makes the answers most probable [s].
+        value: Negative log density [s] of the answers and the model constants, up to an additive constant.
+        scale: Factor [s] for the variances of the discrepancy at which the answers are most probable.
     """
 
     value: NDArray[np.float64]
@@ -298,7 +301,7 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> Misfit:
     """The misfit of constants [s, q], given the kernel of the discrepancy up to a scale factor.
 
     The variances of the links are integrated out. A link that the current constants do not explain therefore keeps its
-    full weight for other constants.
+    full weight when other constants are compared.
     """
     model, prior = corrected.cheap.model, corrected.cheap.constants
     points, (count, links) = corrected.cheap.box.from_unit(corrected.unit), corrected.residuals.shape
@@ -327,7 +330,8 @@ def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.f
 
 
 def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """Draw sets of constants [s, q]. In each set, one, two or all constants are drawn from the prior."""
+    """Draw sets of constants [s, q]. In each set, one, two or all constants are drawn from the prior; the others keep
+    their current values."""
     size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
     drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
     one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
@@ -337,13 +341,14 @@ def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.flo
 
 
 UNLIKELY: Final = 30.0
-"""Excess in negative log density, divided by the number of constants plus 3, above which a member is omitted.
+"""Excess in negative log density, divided by the number of constants plus 3, above which an ensemble member is omitted.
 
-The limit is high because this density assumes independent links. Links share errors, so the true posterior is wider.
+The limit is high because this density assumes that links are independent. In fact, links share errors, so the true
+posterior is wider.
 """
 
 CAPPED: Final = 100.0
-"""Maximum ratio of squared error to predicted variance; larger ratios are reduced to this value."""
+"""Maximum ratio of mean square error to predicted variance; larger ratios are reduced to this value."""
 
 
 class Prediction(NamedTuple):
@@ -362,7 +367,7 @@ class Prediction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Averaged:
-    """Corrected models that explain the same answers.
+    """Corrected models that all explain the same answers.
 
     Attributes:
         members: The models; the most likely model comes first.
@@ -381,14 +386,15 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point in the unit cube [d] as if the prediction had been observed; all members then agree there."""
+        """Add a point [d] in the unit cube as if the prediction had been observed; all members then agree at this
+        point."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
 
 @dataclass
 class ErrorRecord:
-    """Ratios of squared errors to predicted variances for all steps so far.
+    """Ratios of mean square errors to predicted variances for all steps so far.
 
     Attributes:
         ratios: Ratio of mean square error to predicted variance for every step, at most `CAPPED`.
@@ -398,7 +404,8 @@ class ErrorRecord:
 
     @property
     def stretch(self) -> float:
-        """Factor that scales predicted variances; the prior is equivalent to a single step with a ratio of 1."""
+        """Factor by which predicted variances are scaled; the prior is equivalent to a single step with a ratio of
+        1."""
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:

@@ -1,18 +1,18 @@
-"""The discrepancy between an expensive and a cheap model: a Gaussian process over the box for every residual.
+"""The discrepancy between an expensive and a cheap model: for every residual, a Gaussian process over the box.
 
-The discrepancy consists of an offset, a change in response and a remainder, with the variances v_0, v_1 and v_2 of
+The discrepancy consists of an offset, a change in response and a remainder, whose variances are v_0, v_1 and v_2 of
 `regression.py`. h(x) is the scaled deviation of the cheap model's residuals from their mean over the box. Links respond
-similarly to the parameters, so paths that the cheap model lacks respond like paths of other links. The v_1 term is the
-slope of a link's output mapping. It therefore also helps for links that the cheap model does not predict. Each residual
-has its own variance, which is integrated out with an inverse gamma prior. Links that the cheap model predicts poorly
-therefore do not affect other links.
+similarly to the parameters, so paths that the cheap model lacks respond like paths of other links. The v_1 term, which
+is the slope of a link's output mapping, therefore also helps for links that the cheap model does not predict. Each
+residual has its own variance, which is integrated out with an inverse gamma prior. Links that the cheap model predicts
+poorly therefore do not affect other links.
 
 M. C. Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63 (2001) 425, sec. 4.
 
-The predictive variance describes each point separately, but errors at nearby points are nearly equal. Locating the
-possible minima of an uncertain function requires samples of whole functions. A function is drawn from the prior as a
-sum of kernel features with normally distributed weights. A process that interpolates the differences between the
-answers and this function is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process
+The predictive variance describes each point separately, but errors at nearby points are nearly equal. Samples of whole
+functions are therefore required to locate the possible minima of an uncertain function. A function is drawn from the
+prior as a sum of kernel features with normally distributed weights. A process that interpolates the differences between
+the answers and this function is then added (J. T. Wilson et al., Efficiently sampling functions from Gaussian process
 posteriors, ICML 2020, eq. 10). Features of the Matern kernel are cosines whose frequencies follow a t distribution with
 5 degrees of freedom (A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
 """
@@ -71,8 +71,8 @@ def fit(
 ) -> Process:
     """Fit the process to discrepancies [n, m], with the most probable hyperparameters.
 
-    The prior is relative to `scale`, the root mean square of the cheap model's response. If `noisy` is true, the nugget
-    is also estimated. `guess` is an additional starting point of the kernel search.
+    The prior is relative to `scale`, the root mean square of the cheap model's response. If the answers are `noisy`,
+    the nugget is also estimated. `guess` is an additional starting point of the kernel search.
     """
     likelihood = Likelihood(inputs, values, freedom=FREEDOM)
     prior = _prior(inputs.unit.shape[1], noisy)
@@ -105,14 +105,14 @@ def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     """Negative log density [s] of discrepancies [s, n, m] at the most probable scale, and this scale [s].
 
     Discrepancies are whitened by the inverse of the Cholesky factor of K. Each residual follows a multivariate t
-    distribution, in which the covariance K is multiplied by the scale. The prior on the scale is that of a variance.
-    Without a scale, constants that explain the answers much better than the kernel predicts would be only slightly more
-    probable.
+    distribution, in which the covariance K is multiplied by the scale. The prior of the scale is the prior of a
+    variance. Without this scale, constants that explain the answers much better than the kernel predicts would appear
+    only slightly more probable than others.
     """
     count, links = whitened.shape[-2:]
     square, scale = np.sum(whitened**2, axis=-2), np.ones(len(whitened))
     for _ in range(30):
-        # Iterative reweighting converges to the most probable scale of a t distribution.
+        # Iterative reweighting converges to the most probable scale of the t distributions.
         weight = (FREEDOM + count) / (FREEDOM + square / scale[:, None])
         scale = np.maximum(np.mean(weight * square, axis=1) / count, NUGGET)
     density = 0.5 * (FREEDOM + count) * np.log1p(square / scale[:, None] / FREEDOM).sum(axis=1)
@@ -121,10 +121,10 @@ def scaled_density(whitened: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 
 COSINES: Final = 256
-"""Number of features of the Matern kernel."""
+"""Number of features (cosines) that represent the Matern kernel."""
 
 SMOOTHNESS: Final = 5.0
-"""Degrees of freedom of the distribution of frequencies: twice the smoothness of the kernel."""
+"""Degrees of freedom of the t distribution of frequencies: twice the smoothness parameter of the kernel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ class SampledFunction:
 
     Attributes:
         prior: A draw from the prior.
-        rest: Process that interpolates the differences between the answers and the draw at the evaluated points.
+        rest: Process that interpolates the differences, at the evaluated points, between the answers and the draw.
     """
 
     prior: PriorDraw
@@ -185,7 +185,7 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
     size = stretch * np.sqrt(kernel.variances)
 
     def correlated(rows: int) -> NDArray[np.float64]:
-        """Normal draws with the covariance of the residuals [rows, m], as in `Process.root`."""
+        """Normal draws [rows, m] with the covariance between residuals, as in `Process.root`."""
         independent = np.sqrt(FREEDOM) * random.standard_normal((rows, residuals))
         draws = random.standard_normal((rows, count)) @ process.whitened
         return (draws + independent) / np.sqrt(count + FREEDOM)

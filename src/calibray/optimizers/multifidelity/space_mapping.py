@@ -1,30 +1,31 @@
 """Space mapping minimizes an expensive model with the help of a cheap model, which is corrected after every call.
 
 If you know the physics, you already have a cheap approximation of the expensive model, possibly with wrong constants.
-The first call evaluates the minimum of this approximation. After every call, the cheap model is corrected until it
-agrees with all answers (`correction.py`). Many local searches then find the minima of the corrected model in all
-basins. There are two kinds of steps:
+The first call evaluates the engine at the minimum of this approximation. After every call, the cheap model is corrected
+until it agrees with all answers (`correction.py`). Many local searches then find the minima of the corrected model in
+all basins. There are two kinds of steps:
 
-- *Exploitation*: of the minima of the corrected model within a trust region, the minimum with the lowest expected mean
-  square is evaluated. The expectation includes the uncertainty. The trust region is a box around the best point. Its
-  width is halved after a step without an improvement and doubled after a step with an improvement.
+- *Exploitation*: among the corrected model's minima within a trust region, the minimum with the lowest expected mean
+  square is evaluated. The expectation accounts for the uncertainty of the model. The trust region is a box around the
+  best point. Its width is halved after an exploitation without an improvement, and doubled after one with an
+  improvement.
 - *Exploration*: the point with the largest expected improvement over the whole box is evaluated. The improvement is
   computed from draws of the discrepancy, as in `vector_surrogate.py`. Minima of the corrected model in other basins are
-  among the candidates. An exploration follows an exploitation that brought almost no improvement. An exploration also
-  replaces an exploitation if there is no new minimum.
+  among the candidates. An exploration follows an exploitation that brought almost no improvement, and replaces an
+  exploitation if the trust region contains no new minimum.
 
-Both kinds of steps account for constants that a few answers cannot determine, and for the errors of earlier predictions
-(`correction.py`). Otherwise, on synthetic districts, steps jump across half the box to predicted minima that do not
-exist.
+Both kinds of steps account for the uncertainty of constants that a few answers cannot determine, and for the errors of
+earlier predictions (`correction.py`). Without this, steps on synthetic districts jump across half the box to predicted
+minima that do not exist.
 
 The cheap model is used only as long as it helps. Each point is predicted from all other points, once by the corrected
 model and once by the same process without a cheap model. `error_ratio` is the median over the links of the ratio of the
 two squared errors. The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`. Later checks
 fail if the ratio exceeds `MISLED`. After two failed checks in a row, the vector surrogate continues with all
 evaluations so far. If there is no cheap model, the vector surrogate runs from the first call. The median is used
-because a few links dominate a sum over all links. Of twelve synthetic problems, eight had their own cheap model, and
-four had random sinusoids instead. After four calls, the ratio was at most 0.66 with the right model and at least 1.01
-with sinusoids. In one case with the right model, the ratio was 1.9 after three calls.
+because a few links dominate a sum over all links. The limits are based on twelve synthetic problems: eight had their
+own cheap model, and four had random sinusoids instead. After four calls, the ratio was at most 0.66 with the right
+model, and at least 1.01 with sinusoids. In one problem with the right model, the ratio was 1.9 after three calls.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -83,10 +84,10 @@ APART: Final = 0.003
 """Distance in the unit cube below which two minima are considered identical."""
 
 MEMBERS: Final = 8
-"""Maximum number of models with other constants that are averaged with the corrected model in the first steps."""
+"""Maximum number of models with other constants whose predictions are averaged with those of the corrected model."""
 
 AVERAGED: Final = 10
-"""Number of calls up to which predictions are averaged over the corrected model and up to `MEMBERS` other models."""
+"""Number of calls up to which predictions are averaged over the corrected model and at most `MEMBERS` other models."""
 
 SEPARATION: Final = 1e-3
 """Distance in the unit cube below which a point is considered already evaluated."""
@@ -98,17 +99,17 @@ GAINED: Final = 1e-3
 """An exploration follows an exploitation that decreases the root mean square by less than this fraction."""
 
 JUDGED: Final = 3
-"""Number of calls after which checks of the cheap model begin."""
+"""Number of calls after which the first check of the cheap model takes place."""
 
 HELPFUL: Final = 0.8
 """Error ratio above which one of the first `DOUBTS` checks fails."""
 
 MISLED: Final = 2.0
-"""Error ratio above which a later check fails; at that stage, points are so close that any process predicts them
-well."""
+"""Error ratio above which a later check fails; by then, points are so close that any process predicts them well."""
 
 DOUBTS: Final = 2
-"""Number of successive failed checks after which the cheap model is dropped, and number of checks with `HELPFUL`."""
+"""Number of successive failed checks after which the cheap model is dropped; also the number of checks that use
+`HELPFUL`."""
 
 
 @final
@@ -194,7 +195,7 @@ class SpaceMapping(Optimizer):
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
-        """Continue with the vector surrogate and all evaluations so far."""
+        """Continue with the vector surrogate, which starts from all evaluations so far."""
         surrogate = VectorSurrogate(
             self.box.lower, self.box.upper, seed=self._seed, budget=left, batch=self.batch, noisy=self.noisy,
             objective=self._objective,
@@ -207,7 +208,8 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """Minima of the uncorrected cheap model, without the first `turn`, followed by random points [count, d]."""
+        """Points [count, d]: minima of the uncorrected cheap model except for the first `turn` minima, then random
+        points."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -281,8 +283,9 @@ class SpaceMapping(Optimizer):
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """Resize the trust region after an exploitation step, and explore next if the improvement was too small."""
-        # The last step was an exploration, or no evaluation before the last step succeeded.
+        """After an exploitation, resize the trust region; if the improvement was too small, make the next step an
+        exploration."""
+        # There is nothing to resize: the last step was an exploration, or no evaluation before that step succeeded.
         if self._stalled or not np.isfinite(before):
             self._stalled = False
             return
@@ -291,14 +294,14 @@ class SpaceMapping(Optimizer):
 
 
 def error_ratio(corrected: Corrected, *, noisy: bool = False) -> float:
-    """Median over the links of the ratio of the squared errors with and without the cheap model.
+    """Median over the links of the ratio of the squared error with the cheap model to the squared error without it.
 
     Each of at least three points is predicted from all other points. The cheap model helps if the ratio is below 1.
     `noisy` states whether the answers are noisy; it affects only the process without the cheap model.
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)
-    # The same kind of process is fitted to the answers themselves.
+    # Without the cheap model, the same kind of process is fitted to the answers themselves.
     alone = discrepancy.fit(Inputs.plain(corrected.unit), residuals, scale, noisy=noisy)
     with_it, without = (
         np.sum(process.left_out_errors() ** 2, axis=0) for process in (corrected.discrepancy, alone)
