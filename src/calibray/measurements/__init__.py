@@ -1,4 +1,4 @@
-"""Read measured links from tables and check their positions, path losses, weights and groups.
+"""Read measured links from tables, and check the positions, path losses, weights and groups of the links.
 
 `reading.measured_links` converts the rows of a table to a `Measurements` object.
 """

@@ -25,7 +25,8 @@ _DEVICES: Final = (
 """Regular expression for words that mean a receiving device in English, German, Spanish, French and Italian."""
 
 PATTERNS: Final = {
-    # The possible contents of a column, and the regular expression that a whole word of the name must match.
+    # The possible contents of a column, each with the regular expression that a whole word of the column name must
+    # match.
     "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[enp]?ci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
     r"basestation|anchor|beacon|gateway|gw|sender|basisstation|((mobil)?funk)?zelle|celda|cellule|cella|celula|emisor|"
     r"transmisor|emetteur|trasmettitore|estacion|station|stazione",
@@ -80,10 +81,10 @@ LENGTH_UNITS: Final = {
     "foot": 0.3048,
     "inch": 0.0254,
 }
-"""Units of length, other than the metre, that can appear in column names, and their lengths [m]."""
+"""Units of length other than the metre that can appear in column names, and their values in metres."""
 
 WATTS: Final = frozenset({"w", "watt", "watts", "kw", "mw", "dbw"})
-"""Words in a column name that indicate powers in watts or dBW instead of dBm."""
+"""Words that indicate, in a column name, powers in watts or dBW instead of dBm."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 """Units of frequency that can appear in column names, and their values in hertz."""
@@ -91,7 +92,7 @@ FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 
 @dataclass(frozen=True)
 class PositionColumns:
-    """Columns that contain the position of one end of a link.
+    """Columns that contain the positions of one end of the links.
 
     Attributes:
         position: "scene" for coordinates in metres, "geographic" for degrees.
@@ -133,7 +134,7 @@ def without_accents(name: object) -> str:
 
 
 def words(name: object) -> frozenset[str]:
-    """Split a column name into lower-case words. A camel-case word is included both whole and split.
+    """Split a column name into lower-case words. A camel-case word is included both as a whole and in parts.
 
     Example:
         >>> sorted(words("Rx_X [m]"))
@@ -169,9 +170,9 @@ def matches(name: object, *rows: str) -> bool:
 
 
 def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
-    """Find a column of round-trip times or times of flight, with its kind and unit; None if there is no such column.
+    """Find a column of round-trip times or times of flight, its kind and its unit; None if there is no such column.
 
-    Some Wi-Fi devices report a distance in metres instead of a time.
+    Some Wi-Fi devices report a distance in metres instead of a time; metres therefore also count as a unit.
 
     Example:
         >>> find_flight_time(pd.DataFrame({"rtt_std_ns": [2.0], "rtt_ns": [80.0]}))
@@ -184,7 +185,7 @@ def find_flight_time(frame: pd.DataFrame) -> tuple[str, str, str] | None:
             continue
         unit = _unit_of_delay(name, "m")
         if unit is not None and (without_codes(frame[name]).dropna() > 0).mean() > 0.5:
-            # Devices that report a round trip in metres give the one-way distance.
+            # Devices that report the round trip in metres give the one-way distance.
             returned = matches(name, "round-trip time") and unit != "m"
             return name, "round_trip_time" if returned else "time_of_flight", unit
     return None
@@ -236,7 +237,7 @@ def text_instead(frame: pd.DataFrame, *rows: str) -> str:
 
 
 def no_degrees(frame: pd.DataFrame) -> str:
-    """Hint about a column of longitudes or latitudes that are not in degrees; empty if there is no such column.
+    """Hint about a column of longitudes or latitudes whose values are not in degrees; empty if there is none.
 
     Example:
         >>> no_degrees(pd.DataFrame({"lat": [4734.12], "lon": [1041.84]}))
@@ -253,9 +254,9 @@ def no_degrees(frame: pd.DataFrame) -> str:
 
 
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
-    """Find the columns with the position of one end of a link; metres are preferred to degrees.
+    """Find the columns with the positions of one end of the links; metres are preferred to degrees.
 
-    With `unnamed`, columns whose names mention neither the transmitter nor the receiver also qualify.
+    With `unnamed`, columns whose names mention neither transmitter nor receiver also qualify.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -298,9 +299,9 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values and identify the measured quantity.
 
-    Path loss is preferred to path gain, and path gain to received power. Columns whose names contain no decibel unit
-    come last if they contain received power other than that of reference signals. The sign of the values determines
-    whether a column contains losses or gains.
+    Path loss is preferred to path gain, and path gain to received power. Columns of received power, other than that of
+    reference signals, come last if their names contain no decibel unit. The sign of the values determines whether the
+    column contains losses or gains.
 
     Raises:
         InputError: No column appears to contain path loss, path gain or received power.
@@ -315,7 +316,8 @@ def find_value(table: SourceTable) -> ValueColumn:
         if rank is None or matches(name, "another quantity"):
             continue
         if _is_plausible(without_codes(table.frame[name]), kinds[rank][1]):
-            # Powers of reference signals precede RSSI: their bandwidth is known, whereas RSSI includes interference.
+            # Powers of reference signals are preferred to RSSI, because their bandwidth is known and RSSI includes
+            # interference.
             secondary = rank == 2 and not matches(name, "reference signal")
             has_unit = matches(name, "decibel") or not secondary
             candidates.append((not has_unit, rank, secondary, name, kinds[rank][1]))
@@ -344,7 +346,7 @@ def find_value(table: SourceTable) -> ValueColumn:
 
 
 def find_transmit_power(frame: pd.DataFrame) -> str | None:
-    """Find the column of transmitted powers [dBm], or None; columns in watts or dBW are ignored.
+    """Find the column of transmitted powers [dBm]; None if there is none. Columns in watts or dBW are ignored.
 
     Example:
         >>> find_transmit_power(pd.DataFrame({"tx_power_w": [20.0], "EIRP [dBW]": [30.0], "TX power (dBm)": [43.0]}))
@@ -359,7 +361,7 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
 
 
 def find_length_unit(names: Iterable[str]) -> float:
-    """Find the unit of length in column names, and return its length [m]; 1 if no name contains a unit.
+    """Find the unit of length in column names, and return its value in metres; 1 if no name contains a unit.
 
     Raises:
         InputError: The names contain different units.
@@ -377,7 +379,7 @@ def find_length_unit(names: Iterable[str]) -> float:
 
 
 def find_frequency_unit(name: str, default: str = "hz") -> float:
-    """Find the unit of frequency in a column name, and return its value in hertz; without a unit, use `default`.
+    """Find the unit of frequency in a column name, and return its value in hertz; if there is none, use `default`.
 
     Example:
         >>> find_frequency_unit("Downlink [MHz]"), find_frequency_unit("carrier")
@@ -410,7 +412,7 @@ def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
 
 
 def no_frequency(frame: pd.DataFrame) -> str:
-    """Hint about a column of carrier frequencies that are out of range; empty if there is no such column.
+    """Hint about a column of carrier frequencies with values out of range; empty if there is no such column.
 
     Example:
         >>> no_frequency(pd.DataFrame({"Frequency (Hz)": [1842.5]}))
@@ -445,7 +447,7 @@ def find_distance(frame: pd.DataFrame) -> str | None:
 
 
 def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
-    """Whether coordinates can be in degrees: in some tables, columns named longitude and latitude contain metres."""
+    """Whether the coordinates can be in degrees; some tables contain metres in columns named longitude and latitude."""
     return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
 
 
@@ -459,7 +461,7 @@ def _first(names: Iterable[str], row: str) -> str | None:
 
 
 def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
-    """Whether the median of the values is plausible for a quantity; the sign of a loss or gain is ignored."""
+    """Whether the median of the values is plausible for a quantity; for losses and gains, the sign is ignored."""
     median = float(np.nanmedian(values)) if values.notna().any() else 0.0
-    # The median is used because individual values may be logging errors.
+    # The median is used because single values may be logging errors.
     return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

@@ -1,4 +1,4 @@
-"""Read text tables written by loggers and spreadsheets; detect their encoding, separator, header and units."""
+"""Read text tables that loggers and spreadsheets have written; detect the encoding, separator, header and units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
 """File extensions of text tables."""
 
 PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
-"""Strings that stand for a missing number in a column of numbers."""
+"""Strings that represent a missing number in a column of numbers."""
 
 UNITS: Final = frozenset({
     "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
@@ -43,8 +43,9 @@ class _Layout:
     Attributes:
         separator: Column separator; a space stands for any sequence of spaces and tabs.
         skipped: Number of lines above the header.
-        units: Unit of each column, from the row below the header; empty if this row contains no units.
-        unit_lines: Indices of the first line of the row of units and of the line after it, counted from the header.
+        units: Unit of each column, from the row of units below the header; empty if there is no such row.
+        unit_lines: Index of the first line of the row of units, and index of the line after this row; the header has
+            the index 0.
     """
 
     separator: str
@@ -88,9 +89,10 @@ def read_text(path: Path) -> str:
 def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
     r"""Read the rows of a text table; blank lines are ignored.
 
-    Lines above the header are skipped if most of their cells are empty or if their number of cells differs. Units in a
-    row below the header are appended to the column names. Cells in a column of numbers can contain placeholders
-    (`PLACEHOLDERS`). The same decibel unit can follow every number in a column.
+    A line above the header is skipped if most of its cells are empty, or if its number of cells differs from that of
+    the header. Units in the row below the header are appended to the column names. Cells in a column of numbers can
+    contain placeholders (`PLACEHOLDERS`). Every number in a column can be followed by a decibel unit, which must be the
+    same throughout the column.
 
     Args:
         path: Path of the file, for messages.
@@ -130,7 +132,8 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
             index_col=False if has_empty_end else None,
         )
     except ValueError as error:
-        # pandas reports Ctrl-C during reading as "source failed", which has no other cause when reading from memory.
+        # pandas reports Ctrl-C during reading as "source failed"; when pandas reads from memory, this has no other
+        # cause.
         if "source failed" in str(error):
             raise KeyboardInterrupt from None
         raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check the quotes") from None
@@ -147,7 +150,7 @@ def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTab
 
 
 def _layout(text: str, separator: str | None) -> _Layout:
-    """Find the first line that can be a header of the rows below, and the separator that gives the most columns."""
+    """Find the first line that can be the header of the rows below, and the separator that gives the most columns."""
     first_lines = list(islice(io.StringIO(text, newline=""), 30 + 4 * _HEAD))
     for above in range(31):  # number of lines above the header
         layouts: list[tuple[int, _Layout]] = []
@@ -180,7 +183,8 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Split the first non-blank records into cells, with the indices of their first lines and of the next lines."""
+    """Split the first non-blank records into cells; also give the index of each record's first line and of the line
+    after the record."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -195,7 +199,7 @@ def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]
 
 
 def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
-    """Units of the columns, and first line and end of the row of units; () and (0, 0) if there is no such row."""
+    """Units of the columns, and the first line and end of the row of units; () and (0, 0) if there is no such row."""
     if len(records) < 3:
         return (), (0, 0)
     (header, *_), (cells, start, end), (below, *_) = records[:3]
@@ -224,8 +228,8 @@ def _with_unit(name: object, unit: str) -> str:
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
     """Convert a column of strings to numbers.
 
-    The strings can be numbers, numbers with a common decibel unit, or placeholders. If any other
-    string occurs, the column remains text without leading and trailing white space.
+    The strings can be numbers, numbers with a common decibel unit, or placeholders. If any other string occurs, the
+    column remains text, without leading and trailing white space.
     """
     if not pd.api.types.is_string_dtype(column):
         return column
@@ -245,10 +249,11 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
     """Find the decimal mark of the numbers in a CSV text.
 
     Raises:
-        InputError: Decimal marks differ between numbers, or could be thousands separators.
+        InputError: Numbers have different decimal marks, or a decimal mark could be a thousands separator.
     """
     lines: dict[str, int] = {}
-    # The first cell like 1,234 in each column, and the columns with whole numbers of at most four characters.
+    # The first cell of the form 1,234 in each column, and the columns that contain whole numbers of at most four
+    # characters.
     unclear: dict[int, tuple[int, str]] = {}
     whole: set[int] = set()
     is_clear = False
@@ -279,9 +284,9 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
 
 
 def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
-    """Read the header of a CSV text and the line number of each row; reject faults that pandas would correct silently.
+    """Read the header and the line number of each row of a CSV text; reject faults that pandas would correct silently.
 
-    The third result is true if every row ends with an additional empty cell.
+    The third return value is true if every row ends with an additional empty cell.
 
     Raises:
         InputError: The header contains only numbers or names a column twice, or a row has more or fewer cells than the

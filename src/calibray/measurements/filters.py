@@ -1,7 +1,7 @@
-"""Row filters: a small expression language for selecting the rows of a table by the values in its columns.
+"""Row filters: a small expression language that selects rows of a table by the values in the table's columns.
 
-Python parses a filter into a syntax tree, which this module evaluates on whole columns without calling `eval`. Only the
-operators, functions and methods listed below are allowed. Filters cannot contain subscripts, attributes or calls of
+Python parses a filter into a syntax tree; this module evaluates the tree on whole columns, without calling `eval`. Only
+the operators, functions and methods listed below are allowed. Filters cannot contain subscripts, attributes or calls of
 other functions. As in pandas queries, ``&`` and ``|`` mean ``and`` and ``or`` and have the same low precedence.
 """
 
@@ -37,8 +37,8 @@ MAX_PATTERN_LENGTH: Final = 200
 """Maximum number of characters in a regular expression."""
 
 MAX_SEARCH_STEPS: Final = 1e9
-"""Limit for searching a column with a pattern that contains a repetition: the maximum sum, over the column's texts, of
-the squared length. At this limit, a search takes 2 to 5 s."""
+"""Limit for searching a column with a pattern that contains a repetition: maximum of the squared text lengths, summed
+over the column. At this limit, a search takes 2 to 5 s."""
 
 _MAX_INTEGER: Final = int(np.iinfo(np.int64).max)
 
@@ -83,7 +83,7 @@ def _isin(column: pd.Series, values: Any) -> pd.Series:
 
 
 def _check_equality(column: pd.Series, values: Iterable[Any]) -> None:
-    """Reject a comparison of a text column with only numbers, or of a numeric column with only text."""
+    """Reject a comparison of a text column with numbers alone, or of a numeric column with text alone."""
     kinds = {isinstance(value, str) for value in values if value is not None}
     is_text = pd.api.types.infer_dtype(column, skipna=True) == "string"
     if kinds == {False} and is_text:
@@ -135,16 +135,16 @@ def _check_types(kind: type, **values: Any) -> None:
 
 
 def _affix(pat: Any, na: Any) -> Any:
-    """Check the prefix or suffix of a string, or a tuple of prefixes or suffixes."""
+    """Check the argument of a prefix or suffix test: a string, or a tuple of strings."""
     _check_types(bool, na=na)
     for text in pat if isinstance(pat, tuple) else (pat,):
         _check_types(str, pat=text)
     return pat
 
 
-# In practice, a search for a pattern with several repetitions or a repeated group may never end. The allowed patterns
-# are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is possessive, so
-# checking a pattern is also cheap.
+# In practice, a search for a pattern with several repetitions or with a repeated group may never end. The allowed
+# patterns are alternatives of single characters and classes, one of which may repeat in each alternative. `*+` is
+# possessive, so checking a pattern is also cheap.
 _CLASS: Final = r"\[\^?(?:\\.|[^\[\]\\])+\]"
 _CHARACTER: Final = rf"(?:\\[^0-9A-Za-z]|\\[bBdDsSwW]|{_CLASS}|[^\\^$*+?{{}}\[\]()|])"
 _ALTERNATIVE: Final = rf"\^?{_CHARACTER}*+[*+?]?{_CHARACTER}*+\$?"
@@ -169,8 +169,7 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
             "a pattern can contain only characters, classes, ^, $, | and one *, + or ? per alternative; set "
             "regex=False to search for plain text"
         )
-    # A match attempt at each position may run to the end of the text, so the cost is quadratic in the length of the
-    # text.
+    # The match attempt at each position may run to the end of the text, so the cost is quadratic in the text length.
     if _REPETITION.match(pattern):
         steps = float((column.dropna().astype(str).str.len().astype(float) ** 2).sum())
         if steps > MAX_SEARCH_STEPS:
@@ -178,14 +177,14 @@ def _check_pattern(pattern: str, column: pd.Series) -> None:
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
-    """Evaluate a filter on a table, as a mask [rows] of the rows that pass.
+    """Evaluate a filter on a table; the result is a mask [rows] of the rows that pass.
 
     A missing value passes only the comparisons `!=` and `not in`.
 
     Raises:
-        InputError: The filter is malformed or too large, uses an unknown column or a forbidden construct, or is not
-            true or false for each row. The message quotes the faulty part, but does not say where the filter was
-            written.
+        InputError: The filter is malformed or too large, uses an unknown column or a forbidden construct, or does not
+            give true or false for each row. The message quotes the faulty part of the filter, but does not say where
+            the filter comes from.
 
     Example:
         >>> frame = pd.DataFrame({"x": [1, 2, 3], "my set": ["A", "B", "A"]})
@@ -212,9 +211,9 @@ _TOKENS: Final = re.compile(
 
 
 def _as_python(expression: str) -> tuple[str, dict[str, str]]:
-    """Rewrite a filter as a Python expression, with a placeholder for each name in backticks.
+    """Rewrite a filter as a Python expression in which a placeholder replaces each name in backticks.
 
-    The second result maps each placeholder to its column.
+    The second return value maps each placeholder to its column.
     """
     stem = "quoted"
     while stem in expression:
@@ -263,7 +262,7 @@ class _Interpreter:
         self._frame, self._code, self._backticked = frame, code, backticked
 
     def value(self, node: ast.expr) -> _Value:
-        """Evaluate part of a filter to a column or to a single number, string or truth value."""
+        """Evaluate part of a filter; the result is a column, or a single number, string or truth value."""
         try:
             match node:
                 case ast.Name():
@@ -351,7 +350,7 @@ class _Interpreter:
         return value
 
     def _literals(self, node: ast.List | ast.Tuple) -> list[bool | int | float | str | None]:
-        """Evaluate the items of a list or tuple: constants, numbers with a sign, and None for a missing value."""
+        """Evaluate the items of a list or tuple: constants, signed numbers, and None for a missing value."""
         values: list[Any] = []
         for item in node.elts:
             negative = isinstance(item, ast.UnaryOp) and isinstance(item.op, ast.USub)
@@ -366,7 +365,8 @@ class _Interpreter:
 
     def _comparison(self, node: ast.Compare) -> pd.Series | bool:
         """A comparison, or a chain such as `1 < x < 3`."""
-        # Each side is evaluated once: evaluating it for both adjacent comparisons would double the cost at every level.
+        # Each side is evaluated once, because evaluating it for both adjacent comparisons would double the cost at
+        # every level.
         sides = [node.left, *node.comparators]
         values = [self.value(node.left), *(self._argument(side) for side in node.comparators)]
         results = [
@@ -415,7 +415,7 @@ class _Interpreter:
             raise self._refusal(node, "only + - * / // % ** are allowed between numbers")
         left, right = self._number(node.left), self._number(node.right)
         if isinstance(node.op, ast.Pow):
-            # In floating point, raising a whole number to a power is fast and does not wrap around.
+            # Powers of whole numbers are computed in floating point, which is fast and does not wrap around.
             left, right = _as_floats(left), _as_floats(right)
         # Whole numbers in columns wrap around silently, and division by zero gives infinity; `_overflows` detects
         # both.

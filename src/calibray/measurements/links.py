@@ -21,7 +21,7 @@ MIN_DISTANCE: Final = 1e-3
 points is undefined."""
 
 FEW: Final = 8
-"""Smallest number of links from which a trend, a noise model or a prediction error is estimated."""
+"""Smallest number of links from which a trend, noise model or prediction error is estimated."""
 
 MAX_CARRIERS: Final = 32
 """Maximum number of carrier frequencies. A column with more distinct values probably contains a different quantity."""
@@ -34,12 +34,12 @@ class Measurements:
     Attributes:
         tx: Transmitter positions [links, 3], [m].
         rx: Receiver positions [links, 3], [m].
-        path_loss_db: Measured path loss [links], [dB]; all NaN if the links have no measured values.
+        path_loss_db: Measured path losses [links], [dB]; all NaN if the links have no measured values.
         weight: Relative weights [links], [1], greater than 0; 1 by default.
         group: Group label of each link [links]; None if the links have no groups.
         frequency: Carrier frequency of each link [links], [Hz]; None if all links have the carrier of the study.
-        limit_db: Largest measurable path loss [links], [dB]; None if unknown.
-        censored: Mask [links] of the censored links, for which `path_loss_db` is a lower bound; None if no link is
+        limit_db: Largest measurable path loss of each link [links], [dB]; None if unknown.
+        censored: Mask [links] of the censored links, whose `path_loss_db` is only a lower bound; None if no link is
             censored.
         table: Rows of the source table, for filters and messages; by default, one empty row per link.
 
@@ -124,7 +124,7 @@ class Measurements:
 
     @property
     def prepared(self) -> dict[str, int]:
-        """Number of table rows affected by each change, such as a filter or averaging."""
+        """Number of table rows affected by each change, for example by a filter or by averaging."""
         return dict(self.table.changes)
 
     @property
@@ -147,12 +147,13 @@ class Measurements:
         """Index of each link's group in `group_names` [links]."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
-        # Every group is among the sorted names, so its insertion point is its index.
+        # Every group is among the sorted names, so the insertion point of a group is its index.
         return np.searchsorted(self.group_names, self.group)
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """Ascending carrier frequencies [Hz], each with the indices of its links; empty if `frequency` is None."""
+        """Carrier frequencies [Hz] in ascending order, each with the indices of its links; empty if `frequency` is
+        None."""
         if self.frequency is None:
             return ()
         return tuple(
@@ -161,7 +162,7 @@ class Measurements:
         )
 
     def select(self, mask: ArrayLike) -> Measurements:
-        """Select the links for which a mask [links] is true.
+        """The links for which a mask [links] is true.
 
         Raises:
             InputError: The mask is not a Boolean array with one value per link, or selects no link.
@@ -198,7 +199,7 @@ class Measurements:
         return self.table.assign(**missing).where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """Mask [links] of the links that a filter selects as held-out links: at least one, but not all.
+        """Mask [links] of the links that a filter holds out: at least one link, but not all.
 
         Raises:
             InputError: The filter is not valid, or holds out no link or every link.
@@ -267,7 +268,7 @@ def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None
 
 
 def _summary(links: Measurements) -> Table:
-    """Summary table of the links, with their source, number and ranges of values."""
+    """Table that summarizes the links: source, number of links and ranges of values."""
     kind = "measured" if links.measured else "unmeasured"
     rows = [("number", f"{len(links):,} {kind}"), ("distance", _range(links.distance, "m"))]
     if links.measured:

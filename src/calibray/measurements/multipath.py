@@ -1,8 +1,8 @@
 """Compute observables of links from the delays, powers and angles of measured multipath components.
 
 Each observable is defined as in the model, except that components outside the receiver's dynamic range are cut off
-sharply. Repeated snapshots of a link, for example from a rotated array, are averaged. Samples of impulse responses
-above a threshold are treated as components.
+sharply. Repeated snapshots of a link, for example from a rotated array, are averaged. Samples of impulse responses that
+exceed a threshold are treated as components.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ RADIANS: Final = frozenset({"rad", "radian", "radians"})
 
 LEAST_LOSS_DB: Final = 40.0
 """Path loss in free space at 1 m and 2.4 GHz [dB]. A level of 0 dB is treated as a code for a missing value if the
-magnitudes of all other levels exceed this loss. Levels relative to the strongest component also include 0 dB, but the
-magnitudes of other levels are then smaller."""
+magnitudes of all other levels exceed this loss. If levels are relative to the strongest component, 0 dB is valid, but
+the other levels then have smaller magnitudes."""
 
 LONGEST: Final = 0.01
 """Largest plausible delay [s]; light travels 3,000 km in this time."""
@@ -84,17 +84,17 @@ def read_multipath(
     """Read a table with one row per multipath component.
 
     Columns are recognized by name: the delay (`delay_ns`) and the path loss, path gain or power [dB] (`path_loss_db`).
-    Azimuth, elevation, and the number of the rotation or snapshot are optional. An angle is used for both ends of the
+    Columns of azimuth, elevation, and rotation or snapshot number are optional. An angle is used for both ends of the
     link unless the column name specifies one end (`aoa_deg`, `azimuth_tx`).
 
     Args:
         path: The table.
         link: Column that contains the labels of the links.
         compass: Whether azimuths are compass bearings, clockwise from north.
-        missing: Numbers that stand for missing delays or levels. Components with one of these numbers are left out.
+        missing: Numbers that represent missing delays or levels. Components with such a number are left out.
 
     Raises:
-        InputError: The table cannot be read, lacks the column of links, delays or powers, or has several columns of
+        InputError: The table cannot be read, lacks a column of links, delays or powers, or has several columns of
             delays or powers. Delays or powers are implausible or do not match the unit or sign implied by the column
             name.
     """
@@ -108,7 +108,7 @@ def read_multipath(
 
     def find(what: str, pattern: str, other: str, units: Collection[str]) -> str | None:
         found = [name for name, plain in names.items() if re.search(pattern, plain) and other not in plain]
-        # If several columns match, those that name another quantity or state no unit are ignored.
+        # If several columns match, columns that name another quantity or state no unit are ignored.
         if len(found) > 1:
             found = [name for name in found if not matches(name, "another quantity")] or found
         if len(found) > 1:
@@ -165,7 +165,7 @@ def read_multipath(
             if len(own) == 1:
                 values = table.numbers(own[0])
                 values = values if words(own[0]) & RADIANS else np.radians(values)
-                # Compass bearings run clockwise from north, the scene's azimuths counter-clockwise from east.
+                # Compass bearings are measured clockwise from north, the scene's azimuths counter-clockwise from east.
                 angles[plane, end] = np.pi / 2 - values if compass and plane == "azimuth" else values
     return Multipath(
         labels,
@@ -177,7 +177,7 @@ def read_multipath(
 
 
 def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
-    """Reject components whose delay or level is impossible or a code for a missing value.
+    """Reject components whose delay or level is implausible or could be a code for a missing value.
 
     Raises:
         InputError: A value is not plausible.
@@ -198,11 +198,11 @@ def _check_plausible(table: SourceTable, delay: str, power: str) -> None:
 
 
 def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
-    """Compute a statistic in SI units for each link, averaged over the snapshots; the keys are the labels of the links.
+    """Compute a statistic for each link in SI units, averaged over the snapshots; the keys are the labels of the links.
 
-    A snapshot with a single component has no K-factor and is excluded from the mean. Links without any component that
-    the receiver detects are excluded. The bandwidth of the receiver is not applied, because it has already shaped the
-    measured components.
+    A snapshot with a single component has no K-factor and is excluded from the mean. Links without a detectable
+    component are excluded. The bandwidth of the receiver is not applied, because it has already shaped the measured
+    components.
 
     Raises:
         InputError: The statistic requires angles that were not measured or that are in several columns.
@@ -232,7 +232,7 @@ def measure(multipath: Multipath, statistic: Statistic) -> dict[str, float]:
 
 
 def _seen(multipath: Multipath, index: NDArray[np.int64], statistic: Statistic) -> NDArray[np.int64]:
-    """Select the components of a snapshot that the receiver detects."""
+    """Indices of the components of a snapshot that the receiver can detect."""
     delay, level_db = multipath.delay[index], multipath.level_db[index]
     seen = np.isfinite(level_db)
     if statistic.floor_db is not None:
@@ -269,7 +269,7 @@ def _value(
         with np.errstate(divide="ignore"):
             share_db = 10 * np.log10(weight[(values >= low) & (values < high)].sum())
         return float(statistic.limited(share_db))
-    # Circular angular spread of 3GPP TR 38.901, Annex A.1; the bounds keep the logarithm finite and the root real.
+    # Circular angular spread as in 3GPP TR 38.901, Annex A.1; the bounds keep the logarithm finite and the root real.
     resultant = float(np.clip(abs(np.sum(weight * np.exp(1j * np.asarray(angle)))), 1e-300, 1.0))
     return float(np.sqrt(-2 * np.log(resultant)))
 
@@ -282,23 +282,24 @@ DELAYS: Final = ("delay", "delays", "tau", "time", "t")
 """Recognized names of the array that contains the delays of the samples [s]."""
 
 MARGIN_DB: Final = 10.0
-"""Margin by which a sample must exceed the mean noise power to be treated as signal [dB]. The power of noise samples is
-exponentially distributed, so one noise sample in 22,000 exceeds this margin."""
+"""Margin by which a sample must exceed the mean noise power to be treated as signal [dB]. The powers of noise samples
+are exponentially distributed, so one noise sample in 22,000 exceeds this margin."""
 
 
 def read_impulse_responses(
     source: str | Path, labels: list[str], sample_rate: float | None = None, margin_db: float = MARGIN_DB
 ) -> Multipath:
-    """Read impulse responses and keep the samples that exceed the noise.
+    """Read impulse responses, and keep the samples that clearly exceed the noise.
 
     NumPy (.npz, .npy), MATLAB (.mat, including version 7.3) and HDF5 files are supported.
 
     Noise powers are exponentially distributed, so the mean noise power of a response is the median power of its samples
-    divided by ln 2. This estimate requires that most samples of a response are noise.
+    divided by ln 2. This estimate assumes that most samples of a response are noise.
 
     Args:
-        source: A file with one response per link, in the order of `labels`, [links, samples] or [links, snapshots,
-            samples]. Alternatively, a folder with one file per link, [samples] or [snapshots, samples].
+        source: A file with an array [links, samples] or [links, snapshots, samples], whose links are in the order of
+            `labels`. Alternatively, a folder with one file per link, each with an array [samples] or [snapshots,
+            samples].
         labels: Labels of the links.
         sample_rate: Sample rate [Hz]; None if the files contain the delays of the samples [s].
         margin_db: Margin by which a sample must exceed the mean noise power to become a component [dB].
@@ -321,7 +322,7 @@ def read_impulse_responses(
             parts.append(_above_noise(label, np.atleast_2d(response), delay, margin_db))
     else:
         response, delay = _read(source, sample_rate)
-        # MATLAB arrays with one row are read without the row axis.
+        # A MATLAB array with a single row is read without the row axis.
         response = response[None] if response.ndim == 1 and len(labels) == 1 else response
         if len(response) != len(labels) or response.ndim not in (2, 3):
             raise InputError(
@@ -336,7 +337,8 @@ def read_impulse_responses(
 def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
-    """Link, snapshot, delay and level of each sample above the noise in a link's responses [snapshots, samples]."""
+    """Link, snapshot, delay and level of each sample in a link's responses [snapshots, samples] that exceeds the
+    noise."""
     # Squares of small integer types, such as converter samples, would wrap around.
     power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)
@@ -388,7 +390,7 @@ def _read(file: Path, sample_rate: float | None) -> tuple[NDArray[Any], NDArray[
 
 
 def _arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays in a file, by name."""
+    """Read the arrays in a file; the keys are their names."""
     ending = file.suffix.lower()
     if ending == ".npy":
         array = np.load(file, mmap_mode="r", allow_pickle=False)

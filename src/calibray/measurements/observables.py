@@ -1,4 +1,4 @@
-"""Link observables other than path loss: measured statistics of the propagation paths, and their units."""
+"""Observables of links other than path loss: measured statistics of the propagation paths, and their units."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ PROFILES: Final = (DELAY_BIN, *SECTORS)
 """Kinds of observables whose value is the fraction of a link's power in a bin. Each bin is a separate observable."""
 
 SIGNED: Final = (K_FACTOR, *FLIGHTS, *PROFILES)
-"""Kinds of observables with possibly negative measured values: decibels, and times from a clock with a bias."""
+"""Kinds of observables whose measured values can be negative: decibels, and times from a clock with a bias."""
 
 SHARE_RANGE_DB: Final = 30.0
-"""Default dynamic range of the fraction of power in a bin [dB]."""
+"""Default dynamic range of the power fraction in a bin [dB]."""
 
 ROUNDING: Final = 1e-12
 """Tolerance within which a delay [s] or azimuth [rad] counts as equal to a limit. Samples at multiples of 1 / bandwidth
-can lie exactly on a limit. The tolerance is larger than the rounding error of a difference between delays or azimuths,
-but smaller than the resolution of any receiver."""
+can lie exactly on a limit. The tolerance exceeds the rounding error of a difference between delays or azimuths, but is
+smaller than the resolution of any receiver."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class Statistic:
     Attributes:
         kind: One of `KINDS`.
         path: Path whose delay is the time of flight: "first", "strongest", or "mean" (the mean over all paths).
-        dynamic_range_db: Power range below the strongest path in which the receiver detects paths [dB]; None if the
-            receiver detects all paths.
+        dynamic_range_db: Range of powers below the strongest path within which the receiver detects paths [dB]; None if
+            the receiver detects all paths.
         floor_db: Path gain below which the receiver detects no paths [dB]; None for no limit.
-        window: Longest delay after the first path [s]; None for no limit.
+        window: Longest detected delay relative to the first path [s]; None for no limit.
         bandwidth: Bandwidth of the receiver [Hz]; None if the receiver resolves all paths.
-        edges: Edges of the bin, for a kind in `PROFILES`: delays after the first path [s] or azimuths [rad].
+        edges: Edges of the bin, for a kind in `PROFILES`: delays relative to the first path [s], or azimuths [rad].
     """
 
     kind: str
@@ -83,7 +83,7 @@ class Statistic:
     def bin(self) -> tuple[float, float]:
         """Edges of the bin, both reduced by `ROUNDING`.
 
-        A value at the lower edge lies inside the bin, and a value at the upper edge lies outside.
+        A value at the lower edge therefore lies inside the bin, and a value at the upper edge lies outside.
 
         Raises:
             ValueError: The statistic has no bin.
@@ -94,9 +94,9 @@ class Statistic:
         return low - ROUNDING, high - ROUNDING
 
     def limited(self, share_db: ArrayLike) -> NDArray[np.float64]:
-        """Add the power fraction at the lower end of the dynamic range to the power fractions in a bin [dB].
+        """Add the power fraction at the lower end of the dynamic range to the power fractions of bins [dB].
 
-        An empty bin therefore has a finite value both in the model and in the measurements.
+        Empty bins then have a finite value, both in the model and in the measurements.
 
         Example:
             >>> Statistic(DELAY_BIN).limited([-np.inf, -30.0, 0.0]).round(2).tolist()
@@ -123,6 +123,6 @@ class Wanted:
     scale: float
 
     def record(self) -> dict[str, object]:
-        """The description that is sent to the program: name, kind, unit, and the limits stated in the study."""
+        """The description sent to the program: name, kind, unit, and the limits stated in the study."""
         limits = {key: value for key, value in asdict(self.statistic).items() if value is not None}
         return {"name": self.name, "unit": self.unit, **limits}

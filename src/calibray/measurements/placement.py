@@ -16,11 +16,11 @@ from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.support.messages import first_line
 
 TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
-"""Columns that contain the position of a row on a track [deg]."""
+"""Columns that contain the position of each row on a track [deg]."""
 
 NOT_ON_TRACK: Final = "rows without a position on the track, left out"
 """The entry in `changes` for rows that a track does not cover. If another time zone fits clearly better, the entry also
-states the value of `links.track.clock` for that time zone."""
+states the matching value of `links.track.clock`."""
 
 MAX_FILE_SIZE: Final = 200_000_000
 """Size limit of a GPX file [bytes]. A track with one point per second reaches this size after three weeks."""
@@ -29,8 +29,8 @@ MAX_FILE_SIZE: Final = 200_000_000
 def join_track(table: SourceTable, track: Track) -> SourceTable:
     """Interpolate a track linearly at the times of the rows; rows that the track does not cover are left out.
 
-    Times are in ISO 8601 (UTC unless a time zone is stated) or in seconds since 1970. Altitudes are not used, because
-    altitudes from satellite positioning have errors of several metres. The new columns are `TRACK_COLUMNS`.
+    Times are in ISO 8601 (UTC unless a time zone is stated) or in seconds since 1970. Altitudes from satellite
+    positioning are ignored, because they have errors of several metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
         InputError: The track or a time cannot be read, or the track covers no row.
@@ -53,14 +53,14 @@ def join_track(table: SourceTable, track: Track) -> SourceTable:
             f"which covers {first} to {last}; {remedy}"
         )
     table = table.keep(covered, NOT_ON_TRACK + (f"; {clock} would keep more of them" if shift else ""))
-    # Unwrapped longitudes continue beyond 180 degrees where the track crosses the antimeridian.
+    # Where the track crosses the antimeridian, unwrapped longitudes continue beyond 180 degrees.
     longitude = np.interp(seconds[covered], times, np.unwrap(points["longitude"], period=360.0))
     latitude = np.interp(seconds[covered], times, points["latitude"])
     return table.assign(**dict(zip(TRACK_COLUMNS, ((longitude + 180) % 360 - 180, latitude), strict=True)))
 
 
 def read_times(table: SourceTable, name: str) -> NDArray[np.float64]:
-    """Read a column of times in ISO 8601 or in seconds since 1970; returns seconds since 1970 [rows], NaN if missing.
+    """Read a column of times (ISO 8601 or seconds since 1970) as seconds since 1970 [rows], NaN if missing.
 
     Raises:
         InputError: There is no such column, or a time cannot be read.
@@ -98,7 +98,7 @@ def _covered(
 ) -> NDArray[np.bool_]:
     """Mask [rows] of the rows between two successive track points whose times differ by at most `longest_gap`."""
     after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
-    # If a row has exactly the time of a track point, the gaps next to this point do not matter.
+    # If a row has exactly the time of a track point, the gaps before and after this point do not matter.
     before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
     # For times before or after the track, and for missing times (NaN), at least one of the comparisons is false.
     between = (times[before] <= seconds) & (seconds <= times[after])
@@ -108,8 +108,8 @@ def _covered(
 def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], longest_gap: float) -> float:
     """Time-zone shift of the rows relative to the track [s]; 0 unless a shift places clearly more rows on the track.
 
-    Shifts are tested only if at least a tenth of the rows are off the track. A shift is accepted only if it more than
-    halves the number of these rows.
+    Shifts are tested only if at least a tenth of the rows are off the track. A shift is accepted only if it reduces the
+    number of these rows by more than half.
     """
     seconds = seconds[np.isfinite(seconds)]
     seconds = seconds[:: 1 + len(seconds) // 10_000]
@@ -122,7 +122,7 @@ def _better_shift(times: NDArray[np.float64], seconds: NDArray[np.float64], long
 
 
 def _reason(error: Exception) -> str:
-    """The reason why pandas cannot read a time, without the advice of pandas on function arguments."""
+    """The reason why pandas cannot read a time, without pandas's advice on function arguments."""
     return first_line(error).partition(". You might")[0]
 
 
@@ -194,7 +194,7 @@ POSITION_COLUMNS: Final = (*TX_COLUMNS, *RX_COLUMNS)
 
 
 def position_columns(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """`POSITION_COLUMNS` of links from `tx` ([n, 3], or [3] for a single transmitter) to `rx` [n, 3], in metres."""
+    """`POSITION_COLUMNS` [m] of links from `tx` ([n, 3], or [3] for a single transmitter) to `rx` [n, 3]."""
     ends = np.hstack([np.broadcast_to(tx, rx.shape), rx])
     return dict(zip(POSITION_COLUMNS, ends.T, strict=True))
 
@@ -212,8 +212,8 @@ def place_rows(
     """Write the positions of both ends to the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
     A position is x, y, z (numbers in metres, columns in units of `steps.unit_m`) or, with a frame, longitude, latitude
-    [deg] and height [m]. Returns the table with these columns, and the names of the columns for both ends. If a filter
-    is the only step, the arguments are returned unchanged.
+    [deg] and height [m]. Returns the table with these columns, and the names of the columns for both ends. If there is
+    no step other than a filter, the arguments are returned unchanged.
 
     Raises:
         InputError: A column is missing or not numeric, or a geographic position is invalid.
@@ -244,13 +244,13 @@ def _positions(
             ground = steps.ground(positions[:, 0], positions[:, 1])
         except InputError as error:
             raise InputError(f"{table.source}: {end}: {error}") from None
-        # The given heights are above the ground, not above z = 0 or sea level.
+        # The given heights are relative to the ground, not to z = 0 or sea level.
         positions[:, 2] = ground + height
     return positions
 
 
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
-    """Leave out or move receivers inside building outlines.
+    """Leave out receivers inside building outlines, or move them out.
 
     The function uses the steps `inside` and `outside`. Without these steps, it returns the table unchanged. With the
     step `ground`, moved receivers keep their heights above the ground.

@@ -20,15 +20,15 @@ Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64
 """Height of the ground [m] as a function of x and y [m]."""
 
 MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Function that moves positions [n, 3], [m] out of buildings. It returns the new positions, which are NaN if too deep
-inside a building, and the distances moved [n], [m]."""
+"""Function that moves positions [n, 3], [m] out of buildings. It returns the new positions, which are NaN for positions
+too deep inside a building, and the distances [n], [m] by which positions were moved."""
 
 Compute = Callable[[SourceTable], NDArray[np.float64] | None]
 """Function that computes a new column [rows] from the rows of a table; it returns None if a required column is
 missing."""
 
 Divide = Callable[[SourceTable], NDArray[Any]]
-"""Function that splits a table into parts; it returns, for each row, the label of its part [rows]."""
+"""Function that splits a table into parts; it returns the label of each row's part [rows]."""
 
 
 @dataclass(frozen=True)
@@ -82,16 +82,17 @@ class LinkColumns:
 
 @dataclass(frozen=True)
 class Averaging:
-    """Averaging of samples, in linear power.
+    """How samples are averaged in linear power.
 
     Attributes:
-        by: Samples that are averaged together: samples at one "place" (the same receiver position), in one "cell" of a
-            square grid, in one interval of "distance" travelled, or in one window of "time". Distance is summed in row
-            order, separately for rows that are never averaged together, such as rows of different devices.
+        by: Which samples are averaged together: those at the same "place" (receiver position), in the same "cell" of a
+            square grid, in the same interval of "distance" travelled, or in the same window of "time". Distance is
+            summed in row order, separately for groups of rows that are never averaged together, such as rows of
+            different devices.
         size: Width of a cell or length of an interval [m], or duration of a window [s]; not used for "place".
         time: Column of times, for "time".
-        unbiased: Whether to correct the bias of the logarithm of a mean over a small number of samples.
-        minimum_count: Smallest number of samples in an average; averages over fewer samples are left out.
+        unbiased: Whether to correct the bias that arises from taking the logarithm of a mean over few samples.
+        minimum_count: Smallest number of samples per average; averages over fewer samples are left out.
     """
 
     by: Literal["place", "cell", "distance", "time"]
@@ -103,12 +104,12 @@ class Averaging:
 
 @dataclass(frozen=True)
 class Track:
-    """A GPX track from which the positions of rows are interpolated in time.
+    """A GPX track, from which the position of each row is interpolated in time.
 
     Attributes:
         file: The GPX file.
-        time: Column with the times of the rows.
-        longest_gap: Longest time between two track points [s]; rows in longer gaps are left out.
+        time: Column that contains the times of the rows.
+        longest_gap: Longest permitted time between two successive track points [s]; rows in longer gaps are left out.
         clock: Time by which the logger's clock is ahead of the clock of the track [s].
     """
 
@@ -123,18 +124,18 @@ class Preparation:
     """The steps that convert rows to links; none by default.
 
     Attributes:
-        wide: Names of the transmitters by column, for a table with one column per transmitter.
+        wide: Name of the transmitter of each column, for a table with one column per transmitter.
         track: Track from which the columns `placement.TRACK_COLUMNS` [deg] are added to the rows.
         where: Row filter.
         transmitters: Table with one row per transmitter. The columns other than the name are added to the links.
         transmitter: Column with the name of the transmitter, in both tables.
         missing: Numbers that represent missing values, in addition to the codes that are recognized automatically.
         noise_floor_dbm: Noise floor [dBm]. Missing powers are treated as below the noise floor.
-        censored: Whether links at or below the noise floor are kept as censored links.
+        censored: Whether measurements at or below the noise floor are kept as censored links.
         frame: Georeference of the scene if positions are geographic; None if positions are in the scene frame.
         crs: Coordinate reference system of the positions; used only with `frame`.
         unit_m: Length of the unit of the position columns in the scene frame [m].
-        ground: Function that returns the height of the ground; None if heights are not measured from the ground.
+        ground: Function that returns the height of the ground; None if heights are not relative to the ground.
         averaging: Rule for averaging samples; None if samples are not averaged.
         keep: Columns whose labels define groups that are averaged separately, in addition to the transmitter column.
         held_out: Function that labels the parts of the table that are held out separately. Samples are not averaged or
@@ -143,8 +144,9 @@ class Preparation:
             Codes for missing values in these columns are treated as missing.
         means: Columns of other numbers that are averaged over the rows of a link, such as the columns of nuisances.
         flights: Columns of times of flight, in which codes of any magnitude are treated as missing values.
-        computed: Functions that compute additional columns, by column name, after the columns of the transmitters have
-            been added. A function returns None if an optional column that it requires is missing.
+        computed: Functions that compute additional columns, by the name of the new column. They are called after the
+            columns of the transmitters have been added. A function returns None if an optional column that it requires
+            is missing.
         check: Function that rejects a table without a required column. It is called after the columns of the
             transmitters have been added.
         inside: Treatment of receivers inside buildings: "drop", "move", or None to keep their positions.
@@ -176,7 +178,7 @@ class Preparation:
 
     @property
     def is_filter_only(self) -> bool:
-        """Whether no step other than a filter is set, so that the remaining rows are already links."""
+        """Whether no step other than a filter is set; the remaining rows are then already links."""
         steps = (
             *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
             *(self.averaging, self.inside),

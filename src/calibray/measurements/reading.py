@@ -1,13 +1,13 @@
 """Convert a table to links: read the file, select and position rows, average or merge them, and check the links.
 
-Samples are averaged in linear power into one row per area or position. Along a street, the power fades by several dB
-within a wavelength. Ray tracing to a single point does not predict this fading, but it does predict the mean power over
-a few tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio signal", IEEE Trans. Veh.
-Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). Decibel values are not averaged, because their mean is 2.5 dB
-too low for Rayleigh fading.
+Samples in the same area or at the same position are averaged in linear power into one row. Along a street, the power
+fades by several dB within a wavelength. Ray tracing to a single point does not predict this fading, but it does predict
+the power averaged over a few tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a mobile radio
+signal", IEEE Trans. Veh. Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). Averages of decibel values are not
+used, because they are 2.5 dB too low for Rayleigh fading.
 
-The logarithm of a mean over few samples is also biased low, by (10 / ln 10) var / (2 n mean^2) to second order (delta
-method). This bias is 0.2 dB for ten samples with Rayleigh fading, and zero for a single path.
+The logarithm of a mean over few samples is also biased: to second order, it is too low by (10 / ln 10) var / (2 n
+mean^2) (delta method). This bias is 0.2 dB for ten samples with Rayleigh fading, and zero for a single path.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def read_measurements(
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation of the values [dB], as a number or a column; the weights are then 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], as a number or a column; allowed only with "received_power". The path
-            loss is the transmitted power minus the received power, and includes antenna gains and cable losses.
+            loss is the transmitted power minus the received power; it therefore includes antenna gains and cable
+            losses.
         frequency: Column of carrier frequencies, in hertz or in the unit stated in the column name, for links at
             several frequencies.
 
@@ -90,7 +91,7 @@ def measured_links(
     table = complete_rows(chosen, steps, columns.value)
     table, tx, rx = place_rows(table, steps, columns.tx, columns.rx)
     columns = replace(columns, tx=tx, rx=rx)
-    # A missing value can be an error or a power too weak to measure, so the user decides what to do with the row.
+    # A missing value can be an error or a power too weak to be measured, so the user decides what to do with the row.
     remedy = f'leave out these rows: in a study, set links.where = "`{columns.value}`.notna()"'
     if columns.quantity in ("rsrp", "received_power"):
         remedy += "; if the powers were too weak to measure, state links.noise_floor_dbm"
@@ -104,7 +105,7 @@ def measured_links(
 def _note_unused(
     table: SourceTable, chosen: SourceTable, steps: Preparation, columns: LinkColumns
 ) -> SourceTable:
-    """Record the transmitters and groups whose chosen rows have all been removed from the table."""
+    """Record the transmitters and groups none of whose selected rows remain in the table."""
     groups = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     for name in dict.fromkeys([*groups, steps.transmitter]):
         if name not in table.frame or name not in chosen.frame:
@@ -167,8 +168,8 @@ from the wrong column."""
 
 
 LINEAR: Final = 0.1
-"""If the magnitudes of all received powers in a table are below this limit, the powers are probably not in dBm but, for
-example, in watts."""
+"""If the magnitudes of all received powers in a table are below this limit, the powers are probably not in dBm, but for
+example in watts."""
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
@@ -268,7 +269,7 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
 
 
 MAX_UNCERTAINTY_DB: Final = 1.0
-"""Maximum uncertainty of an average due to samples below the noise floor [dB]; averages with a larger uncertainty are
+"""Maximum uncertainty of an average due to samples below the noise floor [dB]; averages that are more uncertain are
 left out."""
 
 _AREA: Final = "calibray area"
@@ -278,11 +279,12 @@ _PART: Final = "calibray part"
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
     """Average samples of the same area, transmitter, frequency and group, if `steps.averaging` is set.
 
-    A sample below the noise floor has a power between zero and the floor, so half the floor enters the average.
-    Averages with an uncertainty above `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples are above
-    the floor. The function uses the steps `averaging`, `keep`, `held_out`, `transmitter` and `noise_floor_dbm`. Each
-    average takes the row of its first sample, with the means of receiver position, value, weight and other observables.
-    The added columns are `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count`.
+    A sample below the noise floor has a power between zero and the floor, so half the power of the floor enters the
+    average. Averages with an uncertainty above `MAX_UNCERTAINTY_DB` are left out, because only their strongest samples
+    are above the floor. The function uses the steps `averaging`, `keep`, `held_out`, `transmitter` and
+    `noise_floor_dbm`. Each average is the row of its first sample, with receiver position, value, weight and other
+    observables replaced by their means. The added columns are `std_db` (standard deviation of the samples [dB], NaN for
+    one sample) and `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
@@ -329,7 +331,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
         highest = 10 ** (mean_level / 10)  # Samples below the floor count as equal to the floor.
         from_below = mean["below"].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
         lowest = np.maximum(highest - from_below, 0.0)
-        # The true mean lies between `lowest` and `highest`.
+        # The true mean power lies between `lowest` and `highest`.
         uncertain = highest > lowest * 10 ** (MAX_UNCERTAINTY_DB / 10)
         mean_level = 10 * np.log10(highest - from_below / 2)
     if averaging.unbiased:
@@ -358,8 +360,8 @@ def _areas(
 ) -> NDArray[np.int64]:
     """Index of the position, cell, interval or window of each row [rows]; `rx` names the columns of x, y and z [m].
 
-    Rows with different numbers in `apart` [rows] are not averaged together, so the distance travelled is summed
-    separately for each number.
+    `apart` [rows] numbers the groups of rows that are averaged separately; the distance travelled is therefore summed
+    separately for each group.
 
     Raises:
         InputError: A column is not numeric, a time cannot be read, or the size is not a number greater than 0.
@@ -403,19 +405,19 @@ def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
 
 
 SAME_POSITION: Final = 1e-4
-"""Difference along each axis up to which positions are treated as equal [m]. Files contain coordinates with a
-resolution of a millimetre at best, and coordinate conversions differ by micrometres."""
+"""Difference along each axis up to which positions are treated as equal [m]. Coordinates in files have a resolution of
+a millimetre at best, and coordinate conversions differ by micrometres."""
 
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Merge the rows of each link into the first row, with the means of linear power, weights and other numbers.
+    """Merge the rows of each link into its first row, with the means of linear power, weights and other numbers.
 
-    Rows belong to one link if their positions agree within `SAME_POSITION`, and they have the same transmitter, kept
-    columns, carrier frequency, transmitted power and times. Rows at different times remain separate links. Rows below
-    the noise floor are not merged with rows above the floor, and held-out rows are not merged with other rows.
-    Receivers inside buildings are moved after merging, because two positions can be moved to the same corner. The
-    function uses the steps `keep`, `held_out`, `observables`, `means`, `transmitter`, `noise_floor_dbm` and
-    `averaging`. If samples were averaged, the table is returned unchanged, because no repeats remain.
+    Rows belong to the same link if their positions agree to within `SAME_POSITION`, and if they have the same
+    transmitter, kept columns, carrier frequency, transmitted power and time. Rows at different times remain separate
+    links. Rows below the noise floor are not merged with rows above the floor, and held-out rows are not merged with
+    other rows. Receivers inside buildings are moved after merging, because two positions can be moved to the same
+    corner. The function uses the steps `keep`, `held_out`, `observables`, `means`, `transmitter`, `noise_floor_dbm` and
+    `averaging`. If samples have been averaged, the table is returned unchanged, because no repeats remain.
 
     Raises:
         InputError: A column is missing or not numeric.
@@ -445,7 +447,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     # A gain or power increases with the linear power, whereas a loss decreases.
     sign = -1.0 if columns.quantity == "path_loss" else 1.0
     level = sign * value
-    # Powers are relative to the strongest row of each link, so that equal values remain equal to the last digit.
+    # Powers are relative to the strongest row of each link, so that the mean of equal values is exactly that value.
     strongest = pd.Series(level).groupby(link).transform("max").to_numpy()
     mean = pd.Series(10 ** ((level - strongest) / 10)).groupby(link).mean().to_numpy()
     merged = {columns.value: sign * (strongest[first] + 10 * np.log10(mean))}
@@ -464,15 +466,16 @@ def _means(table: SourceTable, name: str, group: NDArray[np.int64]) -> NDArray[n
 
 
 LEAST_STEP_DB: Final = 1.0
-"""Smallest recorded effect of a label on the power [dB], if rows with different labels are merged into one link."""
+"""Smallest effect of a label on the power [dB] that is recorded if rows with different labels are merged into one
+link."""
 
 LEAST_RATIO: Final = 5.0
-"""Smallest ratio of an effect to its standard error at which the effect is recorded. By chance, one in two million
+"""Smallest ratio of an effect to its standard error for the effect to be recorded. By chance alone, one in two million
 labels exceeds this ratio."""
 
 MOST_LABELS: Final = 50
 """Maximum number of labels in a column that is tested for effects on the power. A column with more labels probably
-names links or positions."""
+contains the names of links or positions."""
 
 
 def _note_steps(
@@ -482,16 +485,16 @@ def _note_steps(
     usable: NDArray[np.bool_],
     apart: Sequence[str],
 ) -> SourceTable:
-    """Record text columns, such as days, whose labels affect the power but do not distinguish links.
+    """Record text columns (for example, of days) whose labels affect the power, but do not distinguish links.
 
-    Each link counts as one observation of this effect, because the rows of a link can share errors.
+    Each link counts as one observation of the effect, because the rows of a link can share errors.
 
     Args:
         table: The rows.
         link: Index of the link or average to which each row belongs [rows].
         level: Power or gain [rows], [dB].
         usable: Mask of the rows with a level above the noise floor [rows].
-        apart: Columns of labels that are averaged separately.
+        apart: Columns whose labels are averaged separately.
     """
     rows = pd.DataFrame({"link": link, "level": level})[usable]
     for name in [str(name) for name in table.frame if name not in apart]:
@@ -523,7 +526,8 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions; samples that differ in any of these are kept apart."""
+    """Columns that distinguish links at the same positions; samples that differ in any of these columns are kept
+    apart."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
@@ -535,10 +539,10 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
 def join_positions(
     positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Index of each position [N, axes], [m], among the distinct positions, in the order of first occurrence [N].
+    """Index [N] of each position [N, axes], [m], among the distinct positions in order of first occurrence.
 
-    Positions within `SAME_POSITION` of each other, directly or through a chain of other positions, are treated as equal
-    unless they belong to different groups [N].
+    Positions within `SAME_POSITION` of each other, directly or through a chain of other positions, are treated as
+    equal, unless they belong to different groups [N].
 
     Example:
         >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()

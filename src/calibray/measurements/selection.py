@@ -1,4 +1,4 @@
-"""Selection of rows and completion of their columns: wide tables, tracks, filters, transmitters, noise floor."""
+"""Selection of rows, and addition of columns: wide tables, tracks, filters, transmitters, noise floor."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def choose_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTab
 
 
 def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceTable:
-    """Apply the other steps of `select_rows`, which complete the rows and leave out rows without a usable value."""
+    """Apply the other steps of `select_rows`, which add columns and leave out rows without a usable value."""
     if value in table.frame:
         table, coded = mask_codes(table, [value], steps.missing)
-        # If there is a noise floor, a missing power was too weak to measure. Otherwise, a missing power carries no
+        # If there is a noise floor, a missing power was too weak to be measured. Otherwise, a missing power carries no
         # information.
         if steps.noise_floor_dbm is None and coded.any():
             if coded.all():
@@ -78,7 +78,8 @@ def complete_rows(table: SourceTable, steps: Preparation, value: str) -> SourceT
         if name not in table.frame:
             continue
         numbers = _numbers(table.frame[name])
-        # A K-factor of -1 dB is valid, so only numbers of large magnitude count as codes, except in times of flight.
+        # A K-factor of -1 dB is valid, so only numbers of large magnitude are treated as codes, except in times of
+        # flight.
         smallest = 0.0 if name in steps.flights else LARGEST_LEVEL
         found = [code for code in find_codes(numbers, np.inf) if abs(code) >= smallest]
         coded = np.isin(numbers, [*found, *steps.missing])
@@ -107,11 +108,11 @@ def melt(
     keep_empty: bool = False,
     coded: int = 0,
 ) -> SourceTable:
-    """Convert a table with one column per transmitter to one row per link. Links from one row stay together.
+    """Convert a table with one column per transmitter to one row per link. Links from the same row stay together.
 
     `value` and `transmitter` are the names of the new columns. With `keep_empty`, cells without a value also become
-    links, as required for prediction. `coded` is the number of empty cells that contained codes and have already been
-    counted.
+    links, as prediction requires. `coded` is the number of empty cells that contained codes; these cells have already
+    been counted.
 
     Raises:
         InputError: A column is missing, not numeric or has the name of a new column, or no cell has a value.
@@ -126,7 +127,7 @@ def melt(
         if name in others:
             raise InputError(f"{table.source}: column {name!r} already exists; choose another name")
     values = np.column_stack([table.numbers(name, gaps=True) for name in columns])
-    # In row-major order, the links of one row stay together.
+    # In row-major order, links from the same row stay together.
     row, column = np.nonzero(~np.isnan(values) | keep_empty)
     if not len(row):
         raise InputError(f"{table.source}: the columns {', '.join(columns)} contain no value")
@@ -141,8 +142,8 @@ def melt(
 def plain_labels(column: Iterable[object]) -> list[str]:
     """Normalize labels: lower case, no leading or trailing white space, 5 instead of 5.0, colons instead of hyphens.
 
-    Tools write the same address in different forms, such as `AA-BB` and `aa:bb`. They also write whole numbers as
-    floats if a column has gaps.
+    Tools write the same address in different forms, such as `AA-BB` and `aa:bb`, and write whole numbers as floats if a
+    column has gaps.
 
     Example:
         >>> plain_labels(["C4-64", "c4:64 ", 5.0])
@@ -163,7 +164,7 @@ def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str
 
 
 def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
-    """Find the column of names in a table of transmitters; None unless exactly one column qualifies.
+    """Find the column of transmitter names in a table of transmitters; None unless exactly one column qualifies.
 
     The values of a qualifying column are distinct and include at least half of the given labels.
 
@@ -186,7 +187,7 @@ def distinct_rows(transmitters: SourceTable) -> SourceTable:
 
 
 def repeated_label(transmitters: SourceTable, column: str) -> str:
-    """Message with the first repeated label in a column of names, and its rows; empty if all labels are distinct."""
+    """Message that names the first repeated label in a column, and its rows; empty if all labels are distinct."""
     names = transmitters.frame[column]
     if not (repeated := names.duplicated() & names.notna()).any():
         return ""
@@ -231,7 +232,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
     if (spelled != label_of_link).any():
         table = table.assign(**{key: spelled})
     joined = transmitters.frame.drop(columns=name).iloc[index]
-    # Columns of the links keep their names, because filters and positions refer to them.
+    # Columns of the links keep their names, because filters and positions refer to these names.
     renamed = {name: f"{key}_{name}" if name in table.frame else str(name) for name in joined}
     for name, new in renamed.items():
         if new in table.frame or list(renamed.values()).count(new) > 1:
@@ -261,7 +262,7 @@ CODES: Final = (
     *(0, 1, -1, 99, 100, 101, 127, 128, 255, 500, 999, 1000, 9999, 32767, 65535, 99999, 2147483647),
     *(-200, -255, -256, -500, -999, -1000, -9999, -32768, -99999, -2147483648),
 )  # fmt: skip
-"""Codes for missing values in the files of loggers, for example in UJIIndoorLoc (100), Wi-Fi RTT logs (-200) and
+"""Numbers that loggers write as codes for missing values, for example in UJIIndoorLoc (100), Wi-Fi RTT logs (-200) and
 Android logs (2147483647)."""
 
 MIN_GAP_DB: Final = 20.0
@@ -306,7 +307,7 @@ def without_codes(column: pd.Series) -> pd.Series:
 def mask_codes(
     table: SourceTable, columns: Sequence[str], stated: Sequence[float] = ()
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
-    """Replace the codes in columns of measured values by missing values, and record the number of replaced codes.
+    """Replace codes in columns of measured values by missing values, and record the number of replaced codes.
 
     Codes are detected in all columns together, so all columns must contain the same quantity. The `stated` codes are
     always replaced. Returns the table, and a mask [rows] of the rows that contained a code.
@@ -330,7 +331,8 @@ def mask_codes(
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """The numbers in a column [rows]; text becomes NaN, and a later step that needs the values rejects the text."""
+    """The numbers [rows] in a column; text becomes NaN here, and is rejected by any later step that needs the
+    values."""
     if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
         return np.full(len(column), np.nan)
     return pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)

@@ -1,4 +1,4 @@
-"""Rows of a table with line numbers, so that messages can name the file, row and column."""
+"""The rows of a table and their line numbers, so that messages can name the file, row and column."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class SourceTable:
 
     Attributes:
         frame: The rows.
-        row: Line number of each row in the CSV file (a header in the first line is line 1) or in the sheet [rows]. In
-            other tables, rows are numbered from 1.
+        row: Line number [rows] of each row in the CSV file or sheet, in which the first line has the number 1. In other
+            tables, the first row has the number 1.
         source: Name of the file, or another name of the table in messages.
-        changes: Changes made by earlier steps, such as exclusion or averaging of rows, each with the number of affected
-            rows.
+        changes: Changes made by earlier steps, such as the exclusion or averaging of rows, each with the number of
+            affected rows.
         joined: For each column from another table: the name of that table, the name of the column there, and the column
             of labels by which the tables were joined.
     """
@@ -104,7 +104,8 @@ class SourceTable:
     def numbers(
         self, source: str | float, gaps: bool = False, remedy: str = "remove these rows"
     ) -> NDArray[np.float64]:
-        """A column as finite numbers [rows], or a number repeated for all rows. With `gaps`, missing values are NaN.
+        """A column as finite numbers [rows], or a given number repeated for all rows. With `gaps`, missing values are
+        NaN.
 
         Messages about missing values end with `remedy`.
 

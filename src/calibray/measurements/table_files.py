@@ -1,7 +1,7 @@
 """Read tables from CSV, Parquet and Excel files.
 
 The first sheet of a workbook is converted to CSV text, so that one parser reads both formats. Sheets are read row by
-row, so a single value in the last row and column of a sheet does not increase the memory needed.
+row, so that a single value in the last row and column of a sheet does not increase the memory needed.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 
 
 def sheet_text(path: Path) -> tuple[list[int], str]:
-    """Read the first sheet of a workbook as CSV text, with the row number of each row that is not blank.
+    """Read the first sheet of a workbook as CSV text, and the number of each row that is not blank.
 
     A formula is replaced by its last computed value. If there is no computed value, the formula remains text, which is
-    rejected in a column of numbers. The first of several merged cells contains the value, and the other cells are
-    empty. The header, which is the first row, determines the columns.
+    rejected in a column of numbers. Of several merged cells, the first contains the value, and the others are empty.
+    The header, which is the first row, determines the columns.
 
     Raises:
         InputError: The file is not a workbook, contains no worksheet, is too large, or has a value in a column without
@@ -136,7 +136,7 @@ def _with_formulas(values: _Cells, formulas: _Cells) -> _Cells:
 
 
 def _below_header(path: Path, rows: list[tuple[int, _Cells]]) -> list[tuple[int, _Cells]]:
-    """Rows truncated or padded to the named columns of the header (the first row)."""
+    """Rows, truncated or padded to the columns that the header (the first row) names."""
     if not rows:
         return rows
     header_row, header = rows[0]
@@ -166,7 +166,7 @@ LARGEST_TABLE: Final = 2 * LARGEST_ROW_GROUP
 memory."""
 
 DECODING_MEMORY: Final = 2 * LARGEST_TABLE
-"""Limit on the address space of the process that first decodes a Parquet file [bytes]."""
+"""Limit on the address space of the separate process that first decodes a Parquet file [bytes]."""
 
 PIECE_ROWS: Final = 100_000
 """Maximum number of rows of a Parquet file that are read together."""
@@ -203,7 +203,7 @@ except Exception as error:
 """
 
 _decoded: Final[set[tuple[str | int, ...]]] = set()
-"""Programs that have run without error, each with the state of the file at that time."""
+"""Programs that have run without errors, each with the state of its file at that time."""
 
 
 def read_table(path: str | Path) -> SourceTable:
@@ -293,7 +293,7 @@ class PiecedTable:
             batches = file.iter_batches(batch_size=min(size, PIECE_ROWS))
             while (frame := _next_frame(path, batches)) is not None:
                 # NumPy integers cannot be missing, so pandas reads an integer column as float in pieces with gaps.
-                # Integer columns in the other pieces are converted here.
+                # The same columns are therefore converted to float in the other pieces.
                 numpy_columns = [
                     name
                     for name in integers_with_gaps
@@ -319,7 +319,7 @@ def _read_parquet(path: Path) -> SourceTable:
 
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
-    """Check and return the declared size of row groups [bytes], because kilobytes can decompress to gigabytes.
+    """Check the declared size of row groups, because kilobytes can decompress to gigabytes; return this size [bytes].
 
     Raises:
         InputError: The size exceeds the limit or the available memory.
@@ -354,7 +354,7 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
 
 
 def _run_elsewhere(path: Path, code: str, size: int) -> None:
-    """Run a program on a file in a separate process with limits, once per program and state of the file.
+    """Run a program on a file in a separate process with limits, but only once per program and state of the file.
 
     Raises:
         InputError: The file requires too much memory or time, or is damaged.
@@ -382,7 +382,7 @@ def _open_parquet(path: Path) -> Any:
     # If the metadata is damaged and contradicts itself, the library terminates the process.
     _run_elsewhere(path, _METADATA.format(path=str(path.resolve())), path.stat().st_size)
     try:
-        # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.
+        # With pre_buffer, pyarrow would read ahead and keep every row group in memory.
         return parquet.ParquetFile(path, pre_buffer=False)
     except Exception as error:
         raise _damaged(path, error) from None
@@ -411,7 +411,7 @@ def with_index_columns(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _without_decimals(frame: pd.DataFrame) -> pd.DataFrame:
-    """Convert the decimal numbers of database exports, which pandas stores as objects, to floats."""
+    """Convert decimal numbers from database exports, which pandas stores as objects, to floats."""
     names = [name for name in frame if pd.api.types.infer_dtype(frame[name], skipna=True) == "decimal"]
     return frame.astype(dict.fromkeys(names, np.float64))
 

@@ -1,7 +1,7 @@
 """Find the columns that describe transmitters.
 
-Such a column contains the names of transmitters in a table of links or transmitters, contains the values of one
-transmitter, or describes transmit antennas. Planning tools and operators use different names for these columns.
+Such a column contains the names of transmitters (in a table of links or transmitters), the values of one transmitter,
+or data of transmit antennas. Planning tools and operators use different names for these columns.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from calibray.measurements.selection import comparison, naming_column, repeated_
 from calibray.measurements.source_table import SourceTable
 
 MAX_DEVICES: Final = 12
-"""Maximum number of receiving devices. A column with more values probably contains a different quantity, such as a
-location."""
+"""Maximum number of receiving devices. A column with more distinct values probably contains a different quantity, such
+as a location."""
 
 
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
     """Find the columns of a wide table, and the transmitter of each column.
 
-    The names of these columns differ only in the name of the transmitter, which is delimited by separators. If the
+    The names of these columns differ only in the transmitter's name, which is delimited by separators. If the
     table contains several quantities, the columns of received power or path loss are chosen. The result is empty if
     fewer than two columns qualify.
 
@@ -37,7 +37,8 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
         >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
         ['A RSS', 'B RSS']
     """
-    # Columns, grouped by the rest of their name, such as " RSS(dBm)" in "AP1 RSS(dBm)".
+    # Columns, grouped by the part of their name that follows or precedes the transmitter, such as " RSS(dBm)" in "AP1
+    # RSS(dBm)".
     families: dict[tuple[str, str], dict[str, str]] = {}
     for name in transmitters:
         pattern = re.compile(rf"(|.*[^a-z0-9]){re.escape(name.lower())}(|[^a-z0-9].*)")
@@ -57,7 +58,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 
 
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
-    """Find columns of a wide table that are named like those of transmitters but belong to no known transmitter.
+    """Find columns of a wide table that are named like those of known transmitters, but belong to no known transmitter.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
@@ -69,14 +70,14 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
     """
     column, name = next(iter(columns.items()))
     before, _, after = column.lower().rpartition(name.lower())
-    # If column names contain only the transmitter, unknown columns differ from known columns only in digits.
+    # If column names consist only of the transmitter's name, unknown columns differ from known columns only in digits.
     middle = r"[^ _]+" if before + after else re.sub(r"\d+", r"\\d+", re.escape(name.lower()))
     pattern = re.compile(rf"{re.escape(before)}{middle}{re.escape(after)}")
     return [str(other) for other in frame if other not in columns and pattern.fullmatch(str(other).lower())]
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
-    """Name for the combined column of a wide table, based on a word that all column names share.
+    """Name for the column that combines the columns of a wide table, based on a word that all their names share.
 
     Example:
         >>> name_melted_values(["RSS AP1", "RSS AP2"])
@@ -92,7 +93,7 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 
     The values of this column are distinct in the table of transmitters. The first column that contains all values of
     the links is chosen. If no column contains all these values, the first column is chosen that shares a value with the
-    links and has a name that indicates a transmitter.
+    links and whose name indicates a transmitter.
     """
     partial = None
     for name in transmitters:
@@ -109,7 +110,8 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 
 
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
-    """Find the column of transmitter names in the links, and the corresponding column in the table of transmitters.
+    """Find the column of transmitter names in a table of links, and the corresponding column in a table of
+    transmitters.
 
     Columns whose names indicate transmitters are tried first, followed by other text columns.
 
@@ -154,7 +156,7 @@ def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) 
 
 
 def find_transmitter_names(transmitters: SourceTable) -> list[str]:
-    """Find the columns of names, such as sites and cells, in a table with one row per transmitter.
+    """Find the columns of names, such as those of sites and cells, in a table with one row per transmitter.
 
     Raises:
         InputError: No column of names distinguishes the transmitters.
@@ -196,10 +198,11 @@ POWERS: Final = (-30.0, 100.0)
 
 
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
-    """Find the columns of azimuth, mechanical and electrical downtilt, by their keys in ``[links.tx_antenna]``.
+    """Find the columns of azimuth, mechanical downtilt and electrical downtilt, by their keys in
+    ``[links.tx_antenna]``.
 
-    A downtilt column without a stated kind is treated as mechanical. Columns with the sum of both tilts are ignored. If
-    the rows are not transmitters, the column names must indicate a transmitter or an antenna.
+    A downtilt column whose name does not state the kind is treated as mechanical downtilt. Columns with the sum of both
+    tilts are ignored. If the rows are not transmitters, the column names must indicate a transmitter or an antenna.
 
     Example:
         >>> frame = pd.DataFrame(columns=["Azimuth (°)", "Mechanical Downtilt (°)", "E-Tilt", "Total Tilt"])
@@ -225,13 +228,13 @@ def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
 
 
 def lacks_angle(column: pd.Series, may_be_empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask [rows] of cells without a number, except empty cells in rows where `may_be_empty` [rows] is true."""
+    """Mask [rows] of the cells without a number, except for empty cells in rows where `may_be_empty` [rows] is true."""
     lacking = pd.to_numeric(column, errors="coerce").isna() & ~(column.isna() & may_be_empty)
     return lacking.to_numpy(bool)
 
 
 def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.bool_]) -> str:
-    """The reason why a column cannot contain the angles of the transmitters; empty if the column can.
+    """The reason why a column cannot contain the angles of the transmitters; empty if it can.
 
     `lacking` is the result of `lacks_angle`.
     """
@@ -245,7 +248,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str, lacking: NDArray[np.boo
 
 
 def find_antenna_names(frame: pd.DataFrame, known: Iterable[str] = ()) -> str | None:
-    """Find the column with the names of antenna models or files.
+    """Find the column that contains the names of antenna models or antenna files.
 
     If several columns qualify, the column with the most `known` names is chosen.
     """
@@ -273,7 +276,7 @@ def plain_name(label: object) -> str:
 
 
 def find_powers(frame: pd.DataFrame) -> dict[str, str]:
-    """Find the column of EIRP or, failing that, of transmitted power [dBm], by its key in ``[links]``."""
+    """Find the column of EIRP [dBm] or, failing that, of transmitted power [dBm], by its key in ``[links]``."""
     likely = [
         name
         for name in numeric_columns(frame)

@@ -236,8 +236,7 @@ class Optimizer(ABC):
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """The best point, followed by the distinct minima that the method keeps; shape [k, d]. The best point can occur
-        twice.
+        """The best point and then the distinct minima that the method keeps [k, d]; the best point can occur twice.
 
         Raises:
             InputError: No evaluation has been passed to `tell` yet.

@@ -160,8 +160,7 @@ class Process:
 
     @property
     def root(self) -> NDArray[np.float64]:
-        """Factor B of the covariance B^T B between residuals, relative to K; shape [f, m], or [f + m, m] with a
-        prior."""
+        """Factor B of the covariance B^T B between residuals, relative to K: [f, m], or [f + m, m] with a prior."""
         rows = self.whitened
         if self.freedom:
             rows = np.vstack([rows, np.sqrt(self.freedom) * np.eye(rows.shape[1])])

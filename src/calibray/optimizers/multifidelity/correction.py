@@ -104,14 +104,13 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """The response, given residuals [k, m] at points spread over the box; `known` [m] marks the predicted
-        residuals."""
+        """The response, given residuals [k, m] at points across the box; `known` [m] marks the predicted residuals."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
 
     def inputs(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Inputs:
-        """Points [k, d] of the unit cube and their responses, computed from the cheap model's residuals [k, m]."""
+        """Points [k, d] of the unit cube and their responses, from the cheap model's residuals [k, m]."""
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -182,8 +181,7 @@ class Corrected:
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64], kernel: Kernel | None = None) -> Corrected:
-        """The model with other constants [q], whose discrepancy passes through the same answers; None keeps the
-        kernel."""
+        """The model with other constants [q] and a discrepancy that fits the same answers; None keeps the kernel."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, kernel or self.discrepancy.kernel)
@@ -330,8 +328,7 @@ def _likelier(corrected: Corrected, random: np.random.Generator) -> NDArray[np.f
 
 
 def _trials(corrected: Corrected, random: np.random.Generator) -> NDArray[np.float64]:
-    """Draw sets of constants [s, q]. In each set, one, two or all constants are drawn from the prior; the others keep
-    their current values."""
+    """Draw sets of constants [s, q]; in each set, one, two or all current constants are redrawn from the prior."""
     size, count = len(corrected.constants), max(FOLLOWED, min(TRIALS, COMPARED // len(corrected.unit)))
     drawn = corrected.cheap.constants.draw(random.standard_normal((count, size)))
     one, another = np.eye(size, dtype=bool)[random.integers(0, size, (2, count))]
@@ -386,8 +383,7 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point [d] in the unit cube as if the prediction had been observed; all members then agree at this
-        point."""
+        """Add a point [d] of the unit cube as if the prediction had been observed; all members then agree there."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
@@ -404,8 +400,7 @@ class ErrorRecord:
 
     @property
     def stretch(self) -> float:
-        """Factor by which predicted variances are scaled; the prior is equivalent to a single step with a ratio of
-        1."""
+        """Factor that scales predicted variances; the prior is equivalent to a single step with a ratio of 1."""
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:

@@ -208,8 +208,7 @@ class SpaceMapping(Optimizer):
             surrogate.tell(answers.x, answers.y, residuals=answers.residuals)
 
     def _first(self, model: CheapModel, count: int, turn: int) -> NDArray[np.float64]:
-        """Points [count, d]: minima of the uncorrected cheap model except for the first `turn` minima, then random
-        points."""
+        """Points [count, d]: minima of the uncorrected cheap model, except the first `turn`, then random points."""
         d = self.box.dimension
 
         def evaluate(unit: NDArray[np.float64]) -> Residuals:
@@ -283,8 +282,8 @@ class SpaceMapping(Optimizer):
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """After an exploitation, resize the trust region; if the improvement was too small, make the next step an
-        exploration."""
+        """After an exploitation, resize the trust region; if the improvement was too small, explore in the next
+        step."""
         # There is nothing to resize: the last step was an exploration, or no evaluation before that step succeeded.
         if self._stalled or not np.isfinite(before):
             self._stalled = False
