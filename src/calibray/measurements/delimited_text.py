@@ -44,8 +44,8 @@ class _Layout:
         separator: Column separator; a space stands for any sequence of spaces and tabs.
         skipped: Number of lines above the header.
         units: Unit of each column, from the row of units below the header; empty if there is no such row.
-        unit_lines: Index of the first line of the row of units, and index of the line after this row; the header has
-            the index 0.
+        unit_lines: Indices, counted from the header, of the first line of the row of units and of the line after this
+            row.
     """
 
     separator: str
@@ -183,8 +183,8 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Split the first non-blank records into cells; also give the index of each record's first line and of the line
-    after the record."""
+    """Split the first non-blank records into cells, with the index of each record's first line and of the line after
+    it."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
@@ -252,7 +252,7 @@ def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
         InputError: Numbers have different decimal marks, or a decimal mark could be a thousands separator.
     """
     lines: dict[str, int] = {}
-    # The first cell of the form 1,234 in each column, and the columns that contain whole numbers of at most four
+    # The first number with a comma or point in each column, and the columns that contain whole numbers of at most four
     # characters.
     unclear: dict[int, tuple[int, str]] = {}
     whole: set[int] = set()

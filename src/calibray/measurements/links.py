@@ -17,8 +17,8 @@ from calibray.support.messages import counted, first_line, shortened
 from calibray.tables import Column, Table, hertz, named, short_html, short_text
 
 MIN_DISTANCE: Final = 1e-3
-"""Distance below which a transmitter and a receiver are treated as coincident [m]. The path loss between coincident
-points is undefined."""
+"""Distance below which transmitter and receiver are treated as coincident [m]. The path loss between coincident points
+is undefined."""
 
 FEW: Final = 8
 """Smallest number of links from which a trend, noise model or prediction error is estimated."""
@@ -46,7 +46,7 @@ class Measurements:
     Raises:
         InputError: The shapes of the arrays disagree. A position is not finite, or a transmitter coincides with its
             receiver. A weight is not positive and finite. A carrier frequency is out of range, or there are too many
-            carriers. A path loss is infinite, or only some links have a path loss.
+            carrier frequencies. A path loss is infinite, or only some links have a path loss.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -152,8 +152,7 @@ class Measurements:
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """Carrier frequencies [Hz] in ascending order, each with the indices of its links; empty if `frequency` is
-        None."""
+        """Carrier frequencies [Hz], ascending, each with the indices of its links; empty if `frequency` is None."""
         if self.frequency is None:
             return ()
         return tuple(

@@ -337,8 +337,7 @@ def read_impulse_responses(
 def _above_noise(
     label: str, response: NDArray[Any], delay: NDArray[np.float64], margin_db: float
 ) -> tuple[NDArray[Any], ...]:
-    """Link, snapshot, delay and level of each sample in a link's responses [snapshots, samples] that exceeds the
-    noise."""
+    """Link, snapshot, delay and level of each sample above the noise in responses [snapshots, samples] of a link."""
     # Squares of small integer types, such as converter samples, would wrap around.
     power = np.abs(response).astype(np.float64) ** 2
     noise = np.median(power, axis=1, keepdims=True) / np.log(2)

@@ -526,8 +526,7 @@ def _note_steps(
 
 
 def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkColumns) -> list[str]:
-    """Columns that distinguish links at the same positions; samples that differ in any of these columns are kept
-    apart."""
+    """Columns that distinguish links at the same positions; samples that differ in such a column are kept apart."""
     groups: Sequence[str] = [columns.group] if isinstance(columns.group, str) else columns.group or ()
     names = [*groups, *steps.keep]
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]

@@ -33,8 +33,8 @@ class SourceTable:
         source: Name of the file, or another name of the table in messages.
         changes: Changes made by earlier steps, such as the exclusion or averaging of rows, each with the number of
             affected rows.
-        joined: For each column from another table: the name of that table, the name of the column there, and the column
-            of labels by which the tables were joined.
+        joined: For each column from another table: the name of that table, the name of the column in that table, and
+            the column of labels by which the tables were joined.
     """
 
     frame: pd.DataFrame
@@ -104,8 +104,7 @@ class SourceTable:
     def numbers(
         self, source: str | float, gaps: bool = False, remedy: str = "remove these rows"
     ) -> NDArray[np.float64]:
-        """A column as finite numbers [rows], or a given number repeated for all rows. With `gaps`, missing values are
-        NaN.
+        """A column as finite numbers [rows], or a number repeated for all rows. With `gaps`, missing values are NaN.
 
         Messages about missing values end with `remedy`.
 

@@ -37,7 +37,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
         >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
         ['A RSS', 'B RSS']
     """
-    # Columns, grouped by the part of their name that follows or precedes the transmitter, such as " RSS(dBm)" in "AP1
+    # Columns, grouped by the parts of their names before and after the transmitter, such as " RSS(dBm)" in "AP1
     # RSS(dBm)".
     families: dict[tuple[str, str], dict[str, str]] = {}
     for name in transmitters:
@@ -110,8 +110,7 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 
 
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
-    """Find the column of transmitter names in a table of links, and the corresponding column in a table of
-    transmitters.
+    """Find the column of transmitter names in the links, and the matching column in the table of transmitters.
 
     Columns whose names indicate transmitters are tried first, followed by other text columns.
 
@@ -176,7 +175,7 @@ def find_transmitter_names(transmitters: SourceTable) -> list[str]:
 
 
 def find_devices(frame: pd.DataFrame) -> list[str]:
-    """Find the columns whose values can distinguish receiving devices."""
+    """Find the columns whose values can identify receiving devices."""
     quantities = (
         "x", "y", "longitude", "latitude", "height", "altitude or floor", "azimuth", "downtilt", "path gain", "power",
         "received power", "path loss", "decibel", "frequency", "bandwidth or shift", "time", "distance",
@@ -198,8 +197,7 @@ POWERS: Final = (-30.0, 100.0)
 
 
 def find_angles(frame: pd.DataFrame, of_transmitters: bool) -> dict[str, str]:
-    """Find the columns of azimuth, mechanical downtilt and electrical downtilt, by their keys in
-    ``[links.tx_antenna]``.
+    """Find the columns of azimuth, mechanical and electrical downtilt; the keys are those of ``[links.tx_antenna]``.
 
     A downtilt column whose name does not state the kind is treated as mechanical downtilt. Columns with the sum of both
     tilts are ignored. If the rows are not transmitters, the column names must indicate a transmitter or an antenna.

@@ -1,4 +1,4 @@
-"""Seeded ask/tell optimizers that minimize a function over a box; they do not depend on the radio model.
+"""Seeded ask/tell optimizers, which minimize a function over a box and do not depend on the radio model.
 
 Every class is an `Optimizer`. Each class declares which parts of an evaluation it uses, how it respects a budget, and
 whether it uses starting points. `METHODS` lists the classes by their names in study files; `make` constructs an
@@ -130,8 +130,8 @@ def make(
         budget: Number of evaluations; the method's default if None. Methods that stop on their own ignore the budget.
         start: Starting points, [d] or [k, d], for methods that use them.
         starts: Number of further starting points that the method adds to `start`; the method's default if None.
-        objective: Function that maps residuals to the objective, for methods that use residuals; root mean square if
-            None.
+        objective: Function that computes the objective from residuals, for methods that use residuals; root mean square
+            if None.
         cheap_model: A cheap model of the engine, for methods that use a cheap model.
         options: Settings of the method, which override the arguments above.
 

@@ -49,7 +49,7 @@ LARGEST: Final = 0.5
 
 @final
 class POUNDERS(Optimizer):
-    """Derivative-free least squares with quadratic models. The method uses residuals, and spends the whole budget.
+    """Derivative-free least squares with quadratic models. The method uses residuals and spends the whole budget.
 
     Args:
         seed: Seed of the random points at which searches restart.
@@ -254,7 +254,7 @@ def improving_point(
 
 @final
 class GaussNewton(Optimizer):
-    """Gauss-Newton least squares with finite differences. The method uses residuals, and spends the whole budget.
+    """Gauss-Newton least squares with finite differences. The method uses residuals and spends the whole budget.
 
     Args:
         seed: Seed of the random points at which searches restart.

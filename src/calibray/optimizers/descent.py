@@ -1,9 +1,9 @@
 """Projected Levenberg-Marquardt from many starting points in parallel, for least-squares problems in the unit cube.
 
-A step minimizes the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where H and g are J^T J and J^T r
-divided by the number of residuals. Components that would leave the cube are fixed at its faces. The system is solved
-again for the other components until no component leaves the cube. The damping mu is updated from the gain ratio as in
-H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
+A step p minimizes the damped quadratic model g.p + p.(H + mu I) p / 2 within the cube, where g is J^T r and H is J^T J,
+both divided by the number of residuals. Components that would leave the cube are fixed at its faces. The system is
+solved again for the other components until no component leaves the cube. The damping mu is updated from the gain ratio
+as in H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
 
 `descend` is a generator, so the caller decides how points are evaluated. `least_squares.py` calls the engine, and
 `descend_all` calls a model.
@@ -80,7 +80,8 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
 def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute steps [s, d] that stay inside the unit cube, and the decreases in cost that the models predict [s]."""
     count, dimension = starts.unit.shape
-    # The floor keeps the matrix non-singular if two parameters have the same effect and the damping is negligible.
+    # The lower limit keeps the matrix non-singular if two parameters have the same effect and the damping is
+    # negligible.
     floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
     damping = np.maximum(starts.damping, floor)
     damped = starts.curvature + damping[:, None, None] * np.eye(dimension)
@@ -157,7 +158,7 @@ def descend(
     earlier: Starts | None = None,
     followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
-    """Search from all points [s, d] until each search has converged, joined a better search, or been abandoned.
+    """Search from all points [s, d] until each search has converged, been merged into a better one, or been abandoned.
 
     Each search takes at most `iterations` steps. A search has converged if its step, or the relative decrease in cost
     that its model predicts, is at most `tolerance`. A search is abandoned if its cost exceeds the lowest cost by more
@@ -197,7 +198,8 @@ def descend_all(
     iterations: int,
     tolerance: float,
 ) -> Starts:
-    """Search from `unit` [s, d] on a model that returns residuals and their Jacobian, and return the final searches."""
+    """Run searches from `unit` [s, d] on a model that returns residuals and their Jacobian; return the final
+    searches."""
     descent = descend(unit, iterations, tolerance)
     points = next(descent)
     while True:

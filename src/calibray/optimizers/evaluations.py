@@ -230,7 +230,7 @@ def checked_evaluations(
 
 
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
-    """Check that values increase with the mean square of residuals, for new evaluations and the best evaluation so far.
+    """Check that values increase with the mean square of residuals among the new evaluations and the best one so far.
 
     Raises:
         InputError: An evaluation has a lower value but a higher mean square than another evaluation.

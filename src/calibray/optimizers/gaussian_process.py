@@ -1,9 +1,9 @@
 """Bayesian optimization: a Gaussian process models the value, and the expected improvement selects candidates.
 
-This method models one value, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run begins
-with a maximin Latin hypercube. Every further candidate maximizes the logarithm of the expected improvement (D. R.
-Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; for the logarithm, see S. Ament et al., NeurIPS
-2023, arXiv:2310.20708). In the model, a failed evaluation has the worst successful value.
+This method models the value alone, whereas `VectorSurrogate` models every residual; both use `regression.py`. A run
+begins with a maximin Latin hypercube. Every further candidate maximizes the logarithm of the expected improvement (D.
+R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; for the logarithm, see S. Ament et al.,
+NeurIPS 2023, arXiv:2310.20708). In the model, a failed evaluation is assigned the worst successful value.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CANDIDATES = 300
 
 @final
 class GaussianProcess(Optimizer):
-    """Bayesian optimization. The method uses only objective values, and takes 20 d evaluations by default.
+    """Bayesian optimization. The method uses only objective values and takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
@@ -68,7 +68,7 @@ class GaussianProcess(Optimizer):
                 x = self._rng.random(d)
             else:
                 kernel = None if model is None else model.process.kernel
-                # The kernel is fitted at every step up to 40 points, and at every tenth step afterwards.
+                # The kernel is fitted at every step until there are 40 points, and at every tenth step afterwards.
                 if kernel is None or len(points) <= 40 or turn % 10 == 0:
                     model = fit(points, values, guess=kernel)
                 else:

@@ -28,7 +28,7 @@ Where the paper is silent, the following choices apply, in addition to those for
   strictly lower score.
 - The K elites are evaluated in ascending order of their predicted values; ties keep the order of the pack.
 - Memory fusion (eq. 3) uses X_GWO before clipping; the fused position is then clipped.
-- Predictions only determine which wolves are evaluated. Leaders, memories and the best point come from the archive of
+- Predictions determine only which wolves are evaluated. Leaders, memories and the best point come from the archive of
   real evaluations.
 
 With `w_min = w_max = 0`, linear convergence and no surrogate, SGWO-IM gives the same results as GWO, bit for bit.
@@ -110,7 +110,7 @@ def whole_iterations(budget: int) -> dict[str, int]:
 
 @final
 class GWO(Optimizer):
-    """Grey Wolf Optimizer. The method uses only objective values, and takes 600 evaluations by default.
+    """Grey Wolf Optimizer. The method uses only objective values and takes 600 evaluations by default.
 
     Args:
         population: Number of wolves, N.
@@ -167,7 +167,7 @@ def cosine_decay(iteration: int, iterations: int) -> float:
 
 
 def memory_weight(iteration: int, iterations: int, w_min: float, w_max: float) -> float:
-    """The weight of a wolf's memory, w(t) = w_min + (w_max - w_min) (t / T)^2 (paper eq. 4)."""
+    """The weight of a wolf's memory in iteration t, w(t) = w_min + (w_max - w_min) (t / T)^2 (paper eq. 4)."""
     return w_min + (w_max - w_min) * (iteration / iterations) ** 2
 
 
@@ -192,7 +192,7 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
 @final
 class SGWOIM(Optimizer):
-    """The paper's optimizer. The method uses only objective values, and takes 225 evaluations by default.
+    """The paper's optimizer. The method uses only objective values and takes 225 evaluations by default.
 
     Args:
         population: Number of wolves, N.

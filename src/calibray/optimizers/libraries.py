@@ -11,7 +11,7 @@
 All methods start at the best point already passed to `tell`, if any. If a search converges before the budget is used
 up, the method restarts from a random point or population.
 
-A minimizer that calls its objective runs in a separate thread, and waits in the objective for the evaluation. Only
+A minimizer that calls its objective runs in a separate thread; inside the objective, it waits for the evaluation. Only
 one of the two threads runs at a time, so a run is as reproducible as the library itself. If a search is dropped before
 its end, the objective raises an exception inside the library; this exception ends the thread.
 """
@@ -42,7 +42,7 @@ class _AbandonedError(BaseException):
 
 
 def inverted(minimize: Callable[[Evaluate], None]) -> Search:
-    """Run a minimizer in a thread, and yield the candidates [n, d] for which the minimizer requests evaluations.
+    """Run a minimizer in a thread, and yield the candidates [n, d] that the minimizer wants to evaluate.
 
     Raises:
         Exception: Any exception that `minimize` raises.
@@ -81,7 +81,7 @@ def inverted(minimize: Callable[[Evaluate], None]) -> Search:
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. The method uses only objective values, and spends the whole budget.
+    """Covariance matrix adaptation. The method uses only objective values and spends the whole budget.
 
     The method requires `calibray[optimizers]`.
 
@@ -135,7 +135,7 @@ class CMAES(Optimizer):
 
 @final
 class DFOLS(Optimizer):
-    """Derivative-free least squares. The method uses residuals, and spends the whole budget.
+    """Derivative-free least squares. The method uses residuals and spends the whole budget.
 
     The method requires `calibray[optimizers]`.
 
@@ -214,7 +214,7 @@ def _minimize_residuals(
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. The method uses only objective values, and spends the whole budget.
+    """Differential evolution. The method uses only objective values and spends the whole budget.
 
     Args:
         budget: Number of evaluations.

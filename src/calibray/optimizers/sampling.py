@@ -103,7 +103,7 @@ class Sampling(Optimizer):
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. The method uses only objective values, and spends the whole budget.
+    """Independent uniform points. The method uses only objective values and spends the whole budget.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -115,7 +115,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. The method uses only objective values, and spends the whole budget.
+    """One point in each slice of every dimension. The method uses only objective values and spends the whole budget.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -127,7 +127,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. The method uses only objective values, and spends the whole budget.
+    """A scrambled Sobol sequence. The method uses only objective values and spends the whole budget.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

@@ -22,7 +22,7 @@ has grown by a tenth. Between these estimates, the model receives new points but
 the computing time.
 
 In a batch, each candidate after the first is chosen as if the answers to the previous candidates had equalled the
-predictions. In the model, a failed evaluation has the residuals of the worst successful evaluation.
+predictions. In the model, a failed evaluation is assigned the residuals of the worst successful evaluation.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ variance."""
 
 @final
 class VectorSurrogate(Optimizer):
-    """Surrogate of the residual vector. The method uses residuals, and takes 20 d evaluations by default.
+    """Surrogate of the residual vector. The method uses residuals and takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.

@@ -114,7 +114,7 @@ DOUBTS: Final = 2
 
 @final
 class SpaceMapping(Optimizer):
-    """Space mapping. The method uses residuals, and takes 20 d evaluations by default.
+    """Space mapping. The method uses residuals and takes 20 d evaluations by default.
 
     Args:
         budget: Number of evaluations; 20 d if None.
@@ -282,8 +282,7 @@ class SpaceMapping(Optimizer):
         return candidates[np.argmax(gain)]
 
     def _resize(self, best: float, before: float) -> None:
-        """After an exploitation, resize the trust region; if the improvement was too small, explore in the next
-        step."""
+        """Resize the trust region after an exploitation, and explore in the next step if the gain was too small."""
         # There is nothing to resize: the last step was an exploration, or no evaluation before that step succeeded.
         if self._stalled or not np.isfinite(before):
             self._stalled = False
