@@ -331,7 +331,7 @@ def mask_codes(
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """The numbers [rows] in a column; text becomes NaN, and is rejected by a later step that needs the values."""
+    """The numbers [rows] in a column. Text becomes NaN; later steps that need the values reject text."""
     if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
         return np.full(len(column), np.nan)
     return pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)

@@ -58,7 +58,7 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 
 
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
-    """Find columns of a wide table that are named like those of known transmitters, but belong to no known transmitter.
+    """Find columns of a wide table that are named like those of the known transmitters, but belong to other ones.
 
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])

@@ -198,8 +198,7 @@ def descend_all(
     iterations: int,
     tolerance: float,
 ) -> Starts:
-    """Run searches from `unit` [s, d] on a model that returns residuals and their Jacobian; return the final
-    searches."""
+    """Search from `unit` [s, d] on a model that returns residuals and their Jacobian; return the final searches."""
     descent = descend(unit, iterations, tolerance)
     points = next(descent)
     while True:

@@ -85,7 +85,7 @@ APART = 0.01
 
 @final
 class LeastSquares(Optimizer):
-    """Multi-start Levenberg-Marquardt. The method uses residuals and Jacobians and stops on its own, without a budget.
+    """Multi-start Levenberg-Marquardt. The method uses residuals and Jacobians, and stops on its own, without a budget.
 
     Args:
         seed: Seed of basin hopping and of the scrambled Sobol points from which searches start.

@@ -42,7 +42,7 @@ class _AbandonedError(BaseException):
 
 
 def inverted(minimize: Callable[[Evaluate], None]) -> Search:
-    """Run a minimizer in a thread, and yield the candidates [n, d] that the minimizer wants to evaluate.
+    """Run a minimizer in a thread, and yield the candidates [n, d] whose evaluations the minimizer requests.
 
     Raises:
         Exception: Any exception that `minimize` raises.

@@ -8,20 +8,19 @@ Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378).
 *Output mapping*: `discrepancy.py` models the offset, the slope and the remainder.
 
 Slab resonances cause many minima. A kernel that was fitted with wrong constants attributes the resulting errors to the
-discrepancy, and therefore favours these constants. An input mapping therefore proceeds in rounds. A round tries many
-sets of constants, most of which differ from the current set in one or two constants. Sets are compared, each at its
-most probable scale of the discrepancy. Successive rounds use the fitted kernel and the kernel at the mean of the prior
-in turn. In each round, local searches start from the most likely sets, and the kernel is refitted for the best results.
-A result is accepted only if it makes the answers more probable.
+discrepancy, and then favours these constants. An input mapping therefore proceeds in rounds. A round tries many sets of
+constants, most of which differ from the current set in one or two constants. Sets are compared, each at its most
+probable scale of the discrepancy. Successive rounds use the fitted kernel and the kernel at the mean of the prior in
+turn. In each round, local searches start from the most likely sets, and the kernel is refitted for the best results. A
+result is accepted only if it makes the answers more probable.
 
 A few answers are not enough to determine the constants of a cheap model: several sets of constants explain the answers
 equally well, but predict minima at different points. The lowest of these predictions would be too optimistic.
 Predictions are therefore averaged over ensemble members drawn from the posterior of the constants. Each member is
 corrected until it passes through all answers. The uncertainty is small where the members agree. Members are drawn by
-randomized maximum
-likelihood: each member is fitted from a different starting point, to answers and a prior that are both perturbed
-according to their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted variance is scaled
-according to the errors of earlier predictions at points that were not yet used in a fit.
+randomized maximum likelihood: each member is fitted from a different starting point, to answers and a prior that are
+both perturbed according to their uncertainties (D. S. Oliver, N. He, A. C. Reynolds, ECMOR V, 1996). The predicted
+variance is scaled according to the errors of earlier predictions at points that were not yet used in a fit.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ model and once by the same process without a cheap model. `error_ratio` is the m
 two squared errors. The first two checks, after three and four calls, fail if the ratio exceeds `HELPFUL`. Later checks
 fail if the ratio exceeds `MISLED`. After two failed checks in a row, the vector surrogate continues with all
 evaluations so far. If there is no cheap model, the vector surrogate runs from the first call. The median is used
-because a few links dominate a sum over all links. The limits are based on twelve synthetic problems: eight had their
-own cheap model, and four had random sinusoids instead. After four calls, the ratio was at most 0.66 with the right
-model, and at least 1.01 with sinusoids. In one problem with the right model, the ratio was 1.9 after three calls.
+because a few links dominate a sum over all links. Twelve synthetic problems were examined, eight with their own cheap
+model and four with random sinusoids instead. After four calls, the ratio was at most 0.66 with the right model, and at
+least 1.01 with sinusoids. In one problem with the right model, the ratio was 1.9 after three calls.
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
