@@ -183,8 +183,8 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Split the first non-blank records into cells; each record includes the indices of its first line and the next
-    line."""
+    """Split the first non-blank records into cells, each with the indices of its first line and of the line after
+    it."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0

@@ -28,7 +28,7 @@ Compute = Callable[[SourceTable], NDArray[np.float64] | None]
 missing."""
 
 Divide = Callable[[SourceTable], NDArray[Any]]
-"""Function that splits a table into parts; it returns the label of each row's part [rows]."""
+"""Function that splits a table into parts; it returns, for each row, the label of the part [rows]."""
 
 
 @dataclass(frozen=True)
