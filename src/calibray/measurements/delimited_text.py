@@ -183,8 +183,7 @@ def _layout(text: str, separator: str | None) -> _Layout:
 
 
 def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
-    """Split the first non-blank records into cells, each with the indices of its first line and of the line after
-    it."""
+    """Split the first non-blank records into cells, each with the line indices of its start and its end."""
     if mark == " ":
         lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
     reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
