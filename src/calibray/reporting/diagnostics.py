@@ -24,7 +24,7 @@ CLASSES: Final = 6
 """Maximum number of distance classes; all classes contain about the same number of links."""
 
 MOST_UNKNOWNS: Final = 300
-"""Maximum number of unknowns for which the correlations of all pairs are computed."""
+"""Maximum number of unknowns for which correlations are computed between all pairs."""
 
 
 STREETS: Final = 12
@@ -37,13 +37,14 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     Returns:
         Tables by name; a table that cannot be computed is omitted. "distance", "depth" and "group": number of links,
         mean and standard deviation of the residuals [dB] on the calibration links. Residuals are predicted minus
-        measured values of the measured quantity. "obstruction" and "streets": the same statistics, by the length of the
-        straight line below roofs and by groups of neighbouring receivers. "missing_region": the rectangle whose extra
-        loss would explain the largest part of the residuals. "leverage": leverage and residual of every calibration
-        link. "power": share of the links' power by material and type of interaction. "trade_offs": correlation of the
-        draws of each pair of unknowns. "neighbours": semivariance of the residuals by distance between links, computed
-        from the positions of both ends. "moved": value of every parameter before and after calibration, with the change
-        and the width of the 95 % interval as shares of its range.
+        measured values of the measured quantity. "obstruction" and "streets": the same statistics, by the length over
+        which the straight line between the antennas lies below roofs, and by group of neighbouring receivers.
+        "missing_region": the rectangle whose extra loss would explain the largest part of the residuals. "leverage":
+        leverage and residual of every calibration link. "power": share of the links' power by material and type of
+        interaction. "trade_offs": correlation between the draws of each pair of unknowns. "neighbours": semivariance of
+        the residuals by distance between links, where this distance accounts for the positions of both ends. "moved":
+        value of every parameter before and after calibration; the change and the width of the 95 % interval are given
+        as shares of the parameter's range.
     """
     tables = {
         "distance": _by_distance(result),
@@ -70,7 +71,7 @@ def calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]
 
 
 def link_distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
-    """Length of the links [L], [m]; None if the positions are unknown."""
+    """Length of each link [L], [m]; None if the positions are unknown."""
     ends = ends_of(links)
     return None if ends is None else np.linalg.norm(ends[:, 3:] - ends[:, :3], axis=1)
 
@@ -104,7 +105,7 @@ def _by(result: Record, column: str) -> pd.DataFrame:
 
 
 def _by_obstruction(result: Record) -> pd.DataFrame:
-    """Links in sight, and links out of sight in classes by the length of the straight line below roofs."""
+    """Line-of-sight links, and non-line-of-sight links in classes by the length of their straight line below roofs."""
     links, residuals = calibration_links(result)
     if not {OUT_OF_SIGHT, "obstruction_m"} <= set(links.columns) or len(residuals) < FEW:
         return pd.DataFrame()
@@ -150,7 +151,7 @@ def _by_street(result: Record) -> pd.DataFrame:
 
 
 def _missing_region(result: Record) -> pd.DataFrame:
-    """The rectangle in the remark on the calibrated model; without a remark, the rectangle for the prediction model."""
+    """The rectangle in the remark on the calibrated model or, without a remark, that for the prediction model."""
     for remark in result.uncertainty.remarks:
         if remark.kind == RemarkKind.MISSING_REGION:
             return pd.DataFrame([{**remark.values, "significant": True}])
@@ -213,7 +214,7 @@ def _trade_offs(result: Record) -> pd.DataFrame:
 
 
 def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
-    """Draws of an unknown, or the logarithms of the draws if the parameter is searched on a logarithmic scale."""
+    """Draws of an unknown, or their logarithms if the parameter is searched on a logarithmic scale."""
     values = np.array(result.uncertainty.draws[name])
     section = result.study.parameters.get(name)
     return np.log(values) if section is not None and section.scale == "log" else values

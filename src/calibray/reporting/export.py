@@ -35,7 +35,7 @@ VERIFIED_LINKS: Final = 3
 """Number of links for which the export checks the path loss of the exported scene."""
 
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
-"""Settings whose names differ in Sionna RT's path solver."""
+"""Trace settings that have different names in Sionna RT's path solver."""
 
 MATLAB: Final = """function T = materials
 %MATERIALS Calibrated materials as a table, or as a structure in Octave.
@@ -65,15 +65,14 @@ def export(
         folder: Folder to write into; a missing folder is created.
         copy_meshes: If True, copy the meshes into the folder; otherwise, the scene refers to the original files.
         overwrite: If True, also replace files that Calibray did not write.
-        allow_changed_inputs: If True, export even if a file of the scene or an antenna has changed since the
-            calibration.
+        allow_changed_inputs: If True, export even if a scene or antenna file has changed since the calibration.
 
     Returns:
-        Names of the files that were written to the folder. `wording.scene_alone_text` states the difference between the
-        scene alone and the predictions.
+        Names of the files that were written to the folder. `wording.scene_alone_text` states how path loss from the
+        scene alone differs from the predictions.
 
     Raises:
-        InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links can no
+        InputError: The folder cannot be written to, a file in it must not be replaced, the scene or the links can no
             longer be read, the scene has changed, or the scene that Sionna RT loads differs from the calibrated scene.
     """
     study = result.study
@@ -130,7 +129,7 @@ def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
 
 
 def _links(result: Record) -> pd.DataFrame:
-    """Tabulate the links, the nuisance that predictions add to the scene's path loss, and reported path loss [dB]."""
+    """Tabulate links, the nuisance that predictions add to the scene's path loss, and the reported path loss [dB]."""
     scene_db, predicted_db = (result.links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
     if result.prediction.model.parameters is None:
         return result.links.assign(nuisance_db=0.0, reported_db=scene_db)
@@ -141,7 +140,7 @@ def _links(result: Record) -> pd.DataFrame:
 
 
 def matlab(materials: pd.DataFrame, frequency: float) -> str:
-    """Text of a MATLAB function that returns the materials as a table or, in Octave, a structure; carrier in [Hz]."""
+    """A MATLAB function, as text, that returns the materials as a table or, in Octave, a structure; carrier in [Hz]."""
     columns = []
     for name in materials.columns:
         cells = materials[name].tolist()
@@ -154,7 +153,7 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
-    """One row per material: the constants used in predictions, and interval and verdict for calibrated constants."""
+    """One row per material: the constants used in predictions; intervals and verdicts of calibrated constants."""
     names = exported_names(result.scene_materials)
     for name, material in result.scene_materials.items():
         row: dict[str, Any] = {"material": name, "scene_name": names[name]}
@@ -180,7 +179,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
 
 
 def _calibration(result: Record) -> dict[str, Any]:
-    """The data that the script needs beyond the scene and the links."""
+    """The data that the script needs in addition to the scene and the links."""
     study = result.study
     tx, rx = study.antenna_pair
     names = exported_names(result.scene_materials)

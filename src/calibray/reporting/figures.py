@@ -1,4 +1,4 @@
-"""Figures of calibrations: cost and convergence, as in the paper, path loss, and residuals."""
+"""Figures of calibrations: cost and convergence (as in the paper), path loss, and residuals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SYMBOLS: Final = 60
 """Maximum number of links that are drawn as symbols joined by a line."""
 
 FILE_ORDER: Final = 500
-"""Maximum number of links that are drawn in the order of the study's file, with held-out links shaded. If there are
+"""Maximum number of links for which the order is that of the study's file, and held-out links are shaded. If there are
 more links, they are sorted by measured path loss."""
 
 RASTERIZED: Final = 2000
@@ -65,7 +65,7 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @style.styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Draw the lowest RMSE so far versus RT calls and, if known, the RMSE of the global optimum [dB]."""
+    """Draw the lowest RMSE so far [dB] versus RT calls, and the RMSE of the global optimum [dB] if it is known."""
     figure, axes = style.plain_figure("RT calls", "Best RMSE so far [dB]")
     for method, result in results.items():
         history = result.history
@@ -198,7 +198,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 @style.styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured versus modelled values of the first observables, without device biases; None if there are none."""
+    """Draw measured versus modelled values of the first observables, without device biases; None without observables."""
     fits = dict(list(result.fit.observables.items())[:PANELS])
     if not fits:
         return None

@@ -1,4 +1,4 @@
-"""Maps of links on the outlines of buildings, either in the report, coloured by residual, or as a separate file."""
+"""Maps of links and building outlines, drawn in the report (with links coloured by residual) or as a separate file."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Plan:
     regions: str = ""
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions [n, 2 or 3], [m], to coordinates from the upper left corner, in map units [n, 2]."""
+        """Convert positions [n, 2 or 3], [m], to coordinates [n, 2] in map units, from the upper left corner."""
         return np.stack(
             [(points[:, 0] - self.west) * self.scale, (self.north - points[:, 1]) * self.scale], axis=1
         )
@@ -103,7 +103,7 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
 
 
 def marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """The symbols of links on the map: discs at the end with more positions, and triangles at the other end."""
+    """The symbols of links on the map: discs at the end with more distinct positions, and triangles at the other."""
     residuals = links.residual_db
     limit = ramp_limit(residuals)
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
@@ -155,7 +155,7 @@ def ramp_limit(value: NDArray[np.float64]) -> float:
 
 
 def _round(value: float, up: bool = False) -> float:
-    """The largest number in the series 1, 2, 5, 10, ... not above a value or, with `up`, the smallest not below it."""
+    """The largest number of the series 1, 2, 5, 10, ... up to a value or, with `up`, the smallest not below it."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0]) * power
     # A rounding error above a step must not lead to the next step.
@@ -182,12 +182,12 @@ def _outlines(region: Region, layout: Plan) -> str:
 
 
 def _walls(triangles: Triangles, layout: Plan) -> str:
-    """Vertical faces within the map; in plan, each is the line between its ends, and identical lines are drawn once."""
+    """Vertical faces within the map; seen from above, each is a line, and identical lines are drawn once."""
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)
     steep = (np.abs(normal[:, 2]) < STEEP * area) & (area > 0)
     corners = layout.project(triangles.corners[steep].reshape(-1, 3)).round(1).reshape(-1, 3, 2)
-    # The ends of a triangle in plan are the two corners that are furthest apart.
+    # Seen from above, a vertical triangle is the line between the two corners that are furthest apart.
     sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
     longest = np.linalg.norm(sides[:, :, 0] - sides[:, :, 1], axis=2).argmax(axis=1)
     lines = sides[np.arange(len(sides)), longest]
@@ -219,7 +219,7 @@ def save_positions(
     Args:
         file: The file, .png, .svg or .pdf.
         source: Path of a Mitsuba XML file, or `sionna:NAME`.
-        tx: Transmitters [n, 3], [m]; repeated positions are drawn once.
+        tx: Positions of the transmitters [n, 3], [m]; repeated positions are drawn once.
         rx: Receivers [m, 3], [m].
         inputs: Files that are never replaced.
         overwrite: If True, also replace a file that Calibray did not write.
@@ -252,8 +252,8 @@ def draw_positions(source: str | Path, tx: ArrayLike, rx: ArrayLike) -> Figure:
         if not is_ground(mesh, extent):
             corners = mesh.vertices[mesh.faces]
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            # In plan, walls are lines, so they are drawn with an edge; edges between the triangles of a roof are not
-            # drawn.
+            # Seen from above, walls are lines, so they are drawn with an edge; edges between the triangles of a roof
+            # are not drawn.
             steep = np.abs(normal[:, 2]) <= LEVEL * np.linalg.norm(normal, axis=1)
             edges = np.where(steep, FAINT, LINE).tolist()
             axes.add_collection(

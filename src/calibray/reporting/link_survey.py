@@ -38,12 +38,12 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured value, in the measured quantity [L], [dB]; NaN in the cases listed in `residual`."""
+        """Predicted minus measured value of the measured quantity [L], [dB]; NaN in the cases listed in `residual`."""
         return residual(self.table, self.sign)
 
     @property
     def faint(self) -> NDArray[np.bool_]:
-        """Whether a link is near or below the noise floor and was therefore left out of the calibration [L]."""
+        """Whether each link [L] is near or below the noise floor and was therefore left out of the calibration."""
         return _faint(self.table)
 
     @property
@@ -81,7 +81,7 @@ def measured_quantity(result: Record) -> Quantity:
 
 
 def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
-    """Values of the links in the measured quantity [L], in the unit of this quantity.
+    """Values of the measured quantity on the links [L], in its unit.
 
     `name` selects the values: "measured", "before", "after" or "predicted".
     """
@@ -100,12 +100,12 @@ def _column(result: Record) -> str:
 
 
 def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
-    """Predicted minus measured value of a result's links, in the measured quantity [L], [dB].
+    """Predicted minus measured value of the measured quantity on a result's links [L], [dB].
 
-    `sign` is 1 if the measured quantity increases with path loss, otherwise -1. For a link without a path,
-    the fallback model provides the prediction. The residual is NaN if there is no prediction, and for links near or
-    below the noise floor. Links just above the floor are a biased sample, because only favourable errors keep them
-    there. Below the floor, only a lower bound on path loss is known.
+    `sign` is 1 if the measured quantity increases with path loss, otherwise -1. For links without a path, the
+    prediction is that of the fallback model. The residual is NaN if there is no prediction, and for links near or below
+    the noise floor. Links just above the floor are a biased sample, because only favourable errors keep them there.
+    Below the floor, only a lower bound on path loss is known.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return sign * np.where(np.isfinite(difference) & ~_faint(table), difference, np.nan)
@@ -118,7 +118,7 @@ def _faint(table: pd.DataFrame) -> NDArray[np.bool_]:
 def survey(result: Record) -> Survey | None:
     """A calibration's links with positions; positions that the result lacks are read from the measurements.
 
-    The result is None if the measurements cannot be read or have changed.
+    The survey is None if the measurements cannot be read or have changed.
     """
     table, sign = result.links, measured_quantity(result).sign
     if (ends := result.ends) is not None:

@@ -81,7 +81,7 @@ PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("
 
 @dataclass(frozen=True)
 class PageData:
-    """The data that a page shows beyond the result itself.
+    """The data that a page shows in addition to the result itself.
 
     Attributes:
         links: The links with their positions; None if the positions are unknown.
@@ -119,8 +119,8 @@ def report(
         progress: Function that is called with the stage "tracing" after every launch of rays.
 
     Raises:
-        InputError: The file's name does not end in .html or .htm, the file or the folder cannot be written, or a file
-            in the folder must not be replaced.
+        InputError: The file's name does not end in .html or .htm, the file or a file in the folder cannot be written,
+            or a file in the folder must not be replaced.
     """
     check_record(result)
     inputs = result.study.files()
@@ -140,7 +140,7 @@ def report(
             for name, figure in result_figures(result, data.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
-            # Remove figures that belong to an earlier result and that this result does not have.
+            # Remove figures of an earlier result that this result does not have.
             for picture in PICTURES:
                 if Path(picture).stem not in drawn:
                     (folder / picture).unlink(missing_ok=True)
@@ -150,7 +150,7 @@ def report(
 
 
 def collect(result: Record, progress: Progress | None = None) -> PageData:
-    """Collect the data that a page needs beyond the result itself, and list the items that are not available."""
+    """Collect the data that a page needs in addition to the result itself, and list the items that are unavailable."""
     study, missing = result.study, []
     links = survey(result)
     if links is not None and links.group is not None:
@@ -370,7 +370,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
     links = data.links
     if links is None or layout is None:
         return None
-    # Each link stores the index of its group, which takes less space than the name.
+    # Each link stores the index of its group instead of the name, which saves space.
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
     materials = [] if data.scene is None else list(data.scene.materials)

@@ -29,13 +29,13 @@ MARKS: Final[dict[str, str]] = {
 
 
 def heading(result: Record) -> str:
-    """State the study, method, engine and seed of a calibration."""
+    """State which study, method, engine and seed a calibration used."""
     study = result.study
     return f"{study.path.name}: method {study.method.name}, engine {engine_text(result)}, seed {study.method.seed}"
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:
-    """Short form for Python and notebooks: a heading, and tables of parameters, nuisances and accuracy."""
+    """A short form for Python and notebooks: a heading, and tables of parameters, nuisances and accuracy."""
     parts = (parameters(result), nuisances(result), accuracy(result), observables(result))
     parts = (*parts, observables_table(result.accuracy.observables))
     return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
@@ -51,7 +51,7 @@ def tables(result: Record) -> tuple[Table, ...]:
 
 
 def links(result: Record) -> Table:
-    """Numbers of links, and the rows that should be checked."""
+    """Numbers of links, and the rows of links that should be checked."""
     count = result.counts
     censored = result.study.objective.no_path == "censor"
     treatment = (
@@ -78,7 +78,7 @@ def _held_out(result: Record) -> tuple[str, str]:
 def suspicious_rows(
     without_path: Sequence[int], treatment: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Lines about links to check; each line contains a label, the number of links, and their rows with a remedy.
+    """Lines about links to check; each line contains a label, the number of links, their rows, and a remedy.
 
     `treatment` is appended to the list of rows without a path. If `enclosed` is None, the antennas were not checked.
     """
@@ -230,7 +230,7 @@ class Value:
         bounds: Lower and upper bound.
         scale: "linear" or "log".
         positions: Positions of the values "before" and "after" on the bar, from 0 to 1.
-        pieces: Ends of every piece of the interval on the bar, from 0 to 1.
+        pieces: Ends of every separate range of the interval on the bar, from 0 to 1.
         reason: The reason for the verdict; empty if unknown.
         approximate: Whether the interval was computed with an emulator of the engine.
         predicted: The value that predictions use; empty if predictions use the calibrated value or use no scene.
@@ -298,7 +298,7 @@ def _unit(name: str) -> str:
 
 
 def _bar(lower: float, upper: float, scale: str) -> Callable[[float], float]:
-    """Make a function that gives the position of a value between its bounds, from 0 to 1."""
+    """Make a function that converts a value to its position between the bounds, from 0 to 1."""
 
     def position(value: float) -> float:
         value = min(max(value, lower), upper)

@@ -76,7 +76,7 @@ def findings(check: SceneCheck) -> list[Table]:
 
 
 def objects(check: SceneCheck) -> Table:
-    """The objects of a scene, each with its numbers of faces and defects."""
+    """The objects of a scene, each with its number of faces and number of defects."""
     columns = (
         Column("object"), Column("material"), numbers("faces"), numbers("open edges"), numbers("unwelded edges"),
         numbers("flipped faces"), numbers("empty faces"), numbers("repeated faces"),
@@ -105,7 +105,7 @@ def warning_lines(findings: Sequence[Finding]) -> str:
 
 
 def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
-    """Numbers of links, paths and interactions, and the links to check, given by their rows in the file [L].
+    """Numbers of links, paths and interactions, and the links to check, identified by their rows in the file [L].
 
     If `enclosed` is None, the antennas were not checked.
     """
@@ -120,7 +120,7 @@ def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | 
 
 
 def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float) -> tuple[Table | str, ...]:
-    """Change in path loss when tracing with more samples: a summary, the links with the largest changes, and a verdict.
+    """Changes in path loss due to tracing with more samples: a summary, the most affected links, and a verdict.
 
     Links are identified by their rows in the source file [L]; `tolerance_db` is the largest acceptable change [dB].
     """

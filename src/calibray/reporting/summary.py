@@ -27,8 +27,8 @@ from calibray.validation.validation import Validation
 Kind = Literal["plain", "good", "caution"]
 
 RARE: Final = 0.05
-"""If fewer than this share of the links have a path that interacts with a material, the advice is to measure more such
-links."""
+"""If a smaller share of the links than this has a path that interacts with a material, the advice is to measure more
+such links."""
 
 LISTED_VALUES: Final = 6
 """Maximum number of identified values that are listed."""
@@ -59,8 +59,8 @@ class Sentence:
 def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
     """Summarize a calibration in a few sentences: prediction model, fit, benefit, certainty, advice and warnings.
 
-    `links_by_material` is the number of links with a path that interacts with the material, by material; None if there
-    are no paths.
+    `links_by_material` contains, for each material, the number of links with a path that interacts with it; it is None
+    if there are no paths.
     """
     return (
         Sentence("What do predictions use?", f"{prediction_text(result)} {scene_alone_text(result)}".strip()),
@@ -161,7 +161,8 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
     heading = "What should be measured next?"
     unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
     owners = dict.fromkeys(name.rpartition(".")[0] for name in unidentified)
-    # Some parameters belong to antennas, for example, with which paths do not interact.
+    # Some parameters do not belong to a material but, for example, to an antenna, so no path interacts with their
+    # owner.
     materials = [name for name in owners if name in result.materials]
     sentences = []
     # Suggestions need derivatives, which external programs do not provide.
@@ -243,12 +244,12 @@ def _number(value: float) -> str:
 
 
 def _list(names: Sequence[str]) -> str:
-    """Join names with commas, and with "and" before the last; of more than eight names, list only eight."""
+    """Join names with commas, and with "and" before the last; if there are more than eight names, list only eight."""
     if len(names) > 8:
         return named(names, 8)
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _seconds(value: float) -> str:
-    # With two digits, values of at least 99.5 would become 1e+02.
+    # With two significant digits, values of at least 99.5 would be printed as 1e+02.
     return f"{value:.2g} s" if value < 99.5 else f"{value / 60:.0f} min"

@@ -26,14 +26,14 @@ PARAMETERS: Final = 12
 """Maximum number of parameters shown; the least certain parameters come first."""
 
 BARS: Final = 36
-"""Number of bars in the histogram between a parameter's bounds."""
+"""Number of bars in the histogram over the range between a parameter's bounds."""
 
 ROWS: Final = 14
 """Maximum number of rows in the power figure."""
 
 PANELS: Final = 6
-"""Maximum number of panels in a figure; each panel shows an observable or a transmitter, those with the most links
-first."""
+"""Maximum number of panels in a figure; each panel shows one observable or one transmitter, in descending order of the
+number of links."""
 
 DEEPEST_DB: Final = -30.0
 """Level of the antenna pattern at the centre of a figure, relative to its maximum [dB]. The back lobe of a sector
@@ -200,10 +200,10 @@ def by_depth(table: pd.DataFrame) -> Figure:
 
 
 def residuals_by_direction(result: Record) -> Figure | None:
-    """Draw residuals versus the direction from the transmitter to the link, with the antenna pattern on the horizon.
+    """Draw residuals versus the bearing of the receiver from the transmitter, with the horizontal antenna pattern.
 
-    The result is None if the study does not state the mounting of transmitters, or if the links cannot be read or have
-    changed.
+    The figure is None if the study does not state how the transmit antennas are mounted, or if the links cannot be read
+    or have changed.
     """
     study = result.study
     if "tx" not in study.links.mountings:
@@ -236,7 +236,7 @@ def _polar_figures(
     residuals: NDArray[np.float64],
     mounting: Mounting,
 ) -> Figure | None:
-    """Draw one polar plot for each transmitter; `bearing` is measured clockwise from the y axis [L], [rad]."""
+    """Draw one polar plot for each transmitter; `bearing` [L], [rad], is measured clockwise from the y axis."""
     if not names:
         return None
     columns = min(len(names), 3)
@@ -267,7 +267,7 @@ def _pattern_db(mounting: Mounting, link: int, bearing: NDArray[np.float64]) -> 
     """Gain of a link's antenna in the horizontal plane at the given bearings, relative to the maximum [n], [dB]."""
     on_link = mounting.of_paths(np.full(len(bearing), link))
     pose = Pose(*on_link.pose)
-    # Azimuths on the horizon are measured counter-clockwise from east, and bearings clockwise from north.
+    # Azimuths are measured counter-clockwise from east, and bearings clockwise from north.
     angles = np.stack([np.full(len(bearing), np.pi / 2), np.pi / 2 - bearing], axis=1)
     jones = jones_vectors(AntennaPattern.of(mounting.antennas[on_link.index[0]]), wave_basis(angles), pose)
     power = (np.abs(jones) ** 2).sum(axis=(1, 2))

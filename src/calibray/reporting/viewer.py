@@ -1,7 +1,7 @@
 """Data for the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
 
-Positions are rounded to a grid over the scene with 65,536 points in each direction; in a scene of 2 km, the grid points
-are 3 cm apart.
+Positions are rounded to a grid over the scene with 65,536 points in each direction; in a scene 2 km wide, the grid
+points are 3 cm apart.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class Rays:
     Attributes:
         paths: The strongest paths of every link, in descending order of power.
         vertex: Interaction points of the paths [I, 3], [m].
-        gain_db: Power gain of each path with the exported materials, without nuisances [P], [dB].
+        gain_db: Power gain of each path [P], [dB], with the exported materials and without nuisances.
         per_link: Maximum number of paths per link.
         traced: Number of traced paths.
-        links_by_material: Number of links with at least one traced path that interacts with a material, by material.
+        links_by_material: For each material, the number of links with at least one traced path that interacts with it.
     """
 
     paths: Paths
@@ -62,7 +62,7 @@ class Rays:
 
 
 def with_stored_paths(result: Record, ledger: Path) -> Record:
-    """Add paths from the ledger to a result: those of the call at the calibrated values or else at the initial values.
+    """Add paths from the ledger to a result: those of the call at the calibrated or, failing that, the initial values.
 
     The result is unchanged if its engine returns no rays, if the study can no longer be opened, or if the ledger
     contains no call with the study's scene and links.
@@ -110,7 +110,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
     link = paths.link[order]
     # Rank of every path within its link; the strongest path has rank 0.
     rank = np.arange(len(link)) - np.searchsorted(link, link)
-    # Total number of interactions if every link keeps its 1, 2, ... strongest paths.
+    # Total number of interactions if each link keeps only its 1, 2, ... strongest paths.
     interactions = np.cumsum(
         np.bincount(rank[rank < PER_LINK], np.diff(paths.first)[order][rank < PER_LINK], PER_LINK)
     )
@@ -173,7 +173,7 @@ def packed(
 
 
 def _mesh(triangles: Triangles, grid: Grid, materials: list[str]) -> dict[str, Any]:
-    """Order the triangles, first those of the ground, then by material; vertices at the same grid point are merged."""
+    """Order the triangles by material, with those of the ground first; vertices at the same grid point are merged."""
     area = np.linalg.norm(triangles.normal, axis=1)
     kept = np.sort(np.argsort(-area, kind="stable")[:TRIANGLES])
     part = np.where(triangles.ground[kept], 0, 1 + triangles.material[kept])

@@ -62,7 +62,7 @@ def _unused(record: Record) -> str:
 
 
 def carriers_text(record: Record) -> str:
-    """List the carrier frequencies of the links: that of the scene, unless the links state carrier frequencies."""
+    """List the carrier frequencies of the links: that of the scene, unless the links state their own."""
     if "frequency" not in record.links:
         return hertz(record.study.scene.frequency)
     return named(map(hertz, np.unique(record.links["frequency"].to_numpy(float)).tolist()))
@@ -80,7 +80,7 @@ def group_text(record: Record, label: str) -> str:
 
 
 def usable_link_text(record: Record) -> str:
-    """State what a link needs so that it determines the offset of its group."""
+    """State what a link needs to determine the offset of its group."""
     return "a path" + (" and a power well above the noise floor" if "faint" in record.links else "")
 
 
@@ -135,7 +135,7 @@ def scene_alone_text(record: Record) -> str:
 
 
 def _given_engine(record: Record) -> dict[str, Any] | None:
-    """The engine that a user passed to `calibrate`, as its remark describes it; None if the study's was called."""
+    """The engine that a user passed to `calibrate`, as its remark describes it; None if the study's engine was called."""
     remarks = record.uncertainty.remarks
     return next((dict(remark.values) for remark in remarks if remark.kind is RemarkKind.GIVEN_ENGINE), None)
 
@@ -158,7 +158,7 @@ def method_text(record: Record, name: str) -> str:
 
 
 def sampling_text(record: Record) -> str:
-    """State why path loss of the exported scene can differ from reported path loss; empty if there is no reason."""
+    """State why the path loss of the exported scene can differ from the reported one; empty if there is no reason."""
     trace, model = record.study.trace, record.prediction.model
     calibrated = model.parameters is None or model.parameters == record.parameters
     causes = []
@@ -282,7 +282,7 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, described: Callabl
 
 
 def _obstruction_text(table: pd.DataFrame) -> str:
-    """State the mean residual of links in sight, and of links out of sight by the length of the line below roofs."""
+    """State the mean residual of line-of-sight links, and of other links by the length of their line below roofs."""
     parts = []
     for row in table.to_dict("records"):
         digits = 0 if row["to_m"] - row["from_m"] >= 1.0 else 1

@@ -78,7 +78,7 @@ empty."""
 
 
 class LinkCounts(Section):
-    """Numbers of links, stored for human readers; see `Record.counts`. `read` ignores this section."""
+    """Numbers of links, stored only for human readers; see `Record.counts`. `read` ignores this section."""
 
     calibrated_on: Count
     held_out: Count
@@ -118,7 +118,8 @@ def content(
 ) -> dict[str, Any]:
     """The content of `result.json`: all sections of a result except its tables, and the remarks as sentences.
 
-    `files` contains the SHA-256 digests of the result's other files, by name, if these files are already written.
+    `files` contains the SHA-256 digests of the result's other files, keyed by name, if these files have already been
+    written.
     """
     parts = {name: getattr(record, name) for name in SECTIONS}
     values = {name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in parts.items()}
@@ -144,12 +145,12 @@ def write(
     """Write `result.json`, the tables, the calibrated scene and, if there is one, the validation.
 
     Each file is written under a temporary name and then renamed, so every file is either complete or absent.
-    `result.json` is written last and contains the digests of the other files. If a run is killed earlier, `read`
-    therefore rejects the mixture of two runs. `sentences` and the numbers in `validation` are for human readers; `read`
-    ignores both.
+    `result.json` is written last and contains the digests of the other files. If a run is killed before that, `read`
+    therefore rejects the resulting mixture of files from two runs. `sentences` and the numbers in `validation` are only
+    for human readers; `read` ignores both.
 
     Raises:
-        InputError: The folder cannot be written, or a file in it must not be replaced.
+        InputError: The folder cannot be written to, or a file in it must not be replaced.
     """
     target = check_outputs(folder, (*FILES, VALIDATION_FILE), record.study.files(), overwrite)
     try:
@@ -185,8 +186,8 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
     With `allow_changed_inputs`, files that were edited after the run are accepted.
 
     Raises:
-        InputError: The folder contains no result, a result of a different version, a damaged or edited result, or files
-            from several runs.
+        InputError: The folder contains no result, a result in a different version of the format, a damaged or edited
+            result, or files from several runs.
     """
     source = as_path(folder, "result") / RESULT_FILE
     if source.parent.is_file():
@@ -246,8 +247,8 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
     except ValidationError as error:
         refusal = explain(error, Stored, values, str(source))
         raise refusal from None
-    # If the study was moved or copied together with the result, that copy takes precedence, because its files are next
-    # to it.
+    # If the study was moved or copied together with the result, the copy takes precedence, because the files that it
+    # refers to are next to it.
     near = Path(os.path.normpath(source.parent.resolve() / stored.study_from_here))
     study = Study.from_content(
         stored.study, near if stored.study_from_here and exists(near) else stored.study_file
@@ -320,7 +321,7 @@ def check_same_study(study: Study, folder: Path) -> None:
 
 
 def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
-    """Names of the files of the scene and antennas that have changed since the calibration.
+    """Names of the scene and antenna files that have changed since the calibration.
 
     `files` contains the current files with their digests, as in `Setup.files`.
     """
@@ -335,7 +336,7 @@ def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
 
 
 def has_links(result: Record, links: Measurements) -> bool:
-    """Whether a calibration used these links, judged by measured values and positions (within rounding in files)."""
+    """Whether a calibration used these links, judged by measured values and positions (to the rounding in files)."""
     table, ends = result.links, result.ends
     pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
     pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]
@@ -345,7 +346,7 @@ def has_links(result: Record, links: Measurements) -> bool:
 
 
 def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
-    """Write the held-out errors of a study to a folder; the numbers in `figures` are for human readers.
+    """Write the held-out errors of a study to a folder; the numbers in `figures` are only for human readers.
 
     Raises:
         InputError: The folder contains an unreadable result, or the result of another study or of different links.
@@ -380,7 +381,7 @@ def _write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figur
 
 
 def _rounded(values: NDArray[np.float64]) -> list[float | None]:
-    """Round values to 0.0001 dB; None replaces non-finite values, which JSON cannot express."""
+    """Round values to 0.0001 dB; None replaces non-finite values, which JSON cannot represent."""
     return [round(value, 4) if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -403,7 +404,7 @@ def _same(first_db: NDArray[np.float64], second_db: NDArray[np.float64]) -> bool
 
 
 def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
-    """Read the held-out errors of a result; the result is None if no validation was written.
+    """Read the held-out errors of a result; return None if no validation was written.
 
     `measured_db` is the measured path loss of the result's links [links], [dB].
 
@@ -482,7 +483,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         if column not in table:
             raise InputError(f"{file}: has no column {column!r}; run the study again")
         actual = table[column].dtype.kind
-        # Integers are valid floats. In a table without rows, the columns have no kind that could be checked.
+        # Integers are valid floats. If a table has no rows, its columns have no meaningful data type to check.
         if len(table) and actual != kind and not (kind == "f" and actual == "i"):
             raise InputError(f"{file}: column {column!r} has values of the wrong type; run the study again")
         if kind == "f":

@@ -53,7 +53,7 @@ class Average(NamedTuple):
     weight: float = 0.5
 
     def of(self, first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The weighted mean of the values from both models [n]."""
+        """The weighted mean of the values [n] from the two models."""
         return self.weight * first + (1.0 - self.weight) * second
 
 
@@ -98,12 +98,13 @@ class ObservableErrors:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Residuals of several models on the same links; the models that predict a link were fitted without its block.
+    """Residuals of several models on the same links; each link is predicted by models fitted without its block.
 
     Attributes:
         labels: Names of the blocks.
-        block: Index of the block of every link [links]; -1 if the link is not judged.
-        errors: Modelled minus measured path loss by model name [links], [dB]; NaN if the link is not judged.
+        block: Index of the block that contains each link [links]; -1 if the link is not judged.
+        errors: Modelled minus measured path loss of every link [links], [dB], keyed by model name; NaN if the link is
+            not judged.
         position: Positions of the moving end of the links [links, 3], [m]; see `moving_end`.
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
@@ -130,7 +131,7 @@ class Judgement:
         baseline: Name of the best baseline.
         baseline_rmse_db: RMSE of this baseline [dB].
         error_db: Bootstrap standard error of the difference in RMSE [dB]; None if there are fewer than two clusters.
-        clusters: Number of clusters of neighbouring links that were resampled.
+        clusters: Number of resampled clusters, each of neighbouring links.
     """
 
     links: int
@@ -155,10 +156,10 @@ class Judgement:
 
 
 NO_PATH: Final = "no path"
-"""Beginning of the text in the column `basis` for links without a path."""
+"""Beginning of the entry in the column `basis` for links without a path."""
 
 NEW_GROUP: Final = "group without measurements"
-"""Part of the text in the column `basis` of predictions that use the mean offset of the measured groups."""
+"""Part of the entry in the column `basis` for predictions that use the mean offset of the measured groups."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ class FittedTerm:
             groups.
         coefficients: Coefficient by group, [dB] per unit of the column; for other groups, the mean of these
             coefficients is used.
-        centre: Value that is subtracted from the column.
+        centre: Value that is subtracted from the values in the column.
         spread_db: Standard deviation between the groups of a random effect, [dB] per unit of the column; if None, the
             standard deviation of the coefficients is used.
     """
@@ -194,8 +195,8 @@ class BlockErrors:
         between_db: Standard deviation of the error that the links of a new block have in common [dB].
         blocks: Number of blocks.
         reach_m: 90 % quantile of the distance from a held-out link to the nearest calibration link [m].
-        groups_db: RMS contribution of random effects to these errors, for groups that occur in only one block [dB].
-        out_of_sight: RMS error of links out of sight, divided by the RMS error of all links; at least 1.
+        groups_db: RMS contribution [dB] of random effects to these errors, for groups that occur in only one block.
+        out_of_sight: RMS error of non-line-of-sight links, divided by the RMS error of all links; at least 1.
     """
 
     within_db: float
@@ -216,11 +217,11 @@ class PredictionModel:
         terms: Nuisance terms of the model.
         residual_db: RMS of the model's residuals on new links [dB]; None if there are too few links to estimate it.
         basis: Description of the links on which these residuals were computed.
-        links: Number of these links; if these are calibration links, the number of degrees of freedom.
+        links: Number of these links or, if they are calibration links, the number of degrees of freedom.
         sizes_db: Absolute held-out residuals, ascending [dB]; if there are more than 400, 400 quantiles of the
             residuals.
         blocks: Standard deviations of these residuals within and between blocks; None if too few links were held out.
-        averaged: Second set of parameter values, if path loss is the average over two sets; otherwise None.
+        averaged: The second set of parameter values if path loss is averaged over two sets; otherwise None.
     """
 
     name: str

@@ -78,9 +78,9 @@ class Fit:
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
         retrace_gap_db: Largest change in a calibration link's path loss when the scene is traced again with the
             calibrated materials [dB]; None if the paths do not depend on the materials.
-        power_shares: Share of the links' power by material and type of interaction; "line of sight" for paths without
-            interactions. The shares can add up to more than 1, because a path contributes to the share of each of its
-            interactions.
+        power_shares: Share of the links' power by material and type of interaction, or under "line of sight" for paths
+            without interactions. The shares can add up to more than 1, because a path contributes to the share of each
+            of its interactions.
         observables: Accuracy of the calibrated model for the further observables, by name.
     """
 
@@ -125,8 +125,8 @@ class Uncertainty:
     Attributes:
         intervals: 95 % interval and verdict by parameter.
         draws: Posterior draws by parameter, constant and nuisance coefficient; empty if there are no draws.
-        constants_db: Constants that are fixed in the scene but vary in the draws, each with the change in path loss per
-            standard deviation of the constant [dB].
+        constants_db: Constants that are fixed in the scene but vary in the draws, each with the change in path loss
+            [dB] per standard deviation of the constant.
         noise: Posterior weights of the noise models and of an undeclared offset.
         undeclared_offset_db: Best-fitting offset if the study declares no offset [dB]; None if no offset was estimated.
         undeclared_offset_error_db: Standard error of the undeclared offset [dB].
@@ -149,7 +149,7 @@ class Nuisance:
     Attributes:
         coefficients: Coefficient by term and group, [dB] per unit of the term's column; the offset is the term
             "offset", and the group "" contains all links.
-        centres: Value that is subtracted from a term's column, by term.
+        centres: Value that is subtracted from the values in each term's column, by term.
         groups_without_path: Groups that have no offset, because none of their calibration links has a path.
     """
 
@@ -215,9 +215,9 @@ class Provenance:
 
     Attributes:
         files: SHA-256 digests of all files of the scene and the antennas, by path; empty if unknown.
-        rows: Numbers of table rows that were left out, averaged or moved when the rows were converted to links, by
-            cause.
-        enclosed: Antennas inside closed bodies of the scene or below the ground; None if antennas were not checked.
+        rows: Numbers of table rows, by cause, that were left out, averaged or moved when the rows were converted to
+            links.
+        enclosed: Antennas inside closed bodies of the scene or below the ground; None if this was not checked.
     """
 
     files: dict[str, Digest] = field(default_factory=dict)
@@ -227,7 +227,7 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Record:
-    """The data of a finished calibration. This class is abstract; `calibration.result.Result` is the class to use.
+    """The data of a finished calibration. This class is abstract; use `calibration.result.Result` instead.
 
     Attributes:
         study: The study, with the method, seed and engine that were used.
@@ -240,7 +240,7 @@ class Record:
         provenance: The inputs of the calibration.
         links: One row per link, with its row number in the source file, has_path, held_out, and the positions tx_x to
             rx_z [m]. Path loss [dB] is listed as measured, as modelled before and after calibration, as predicted by
-            the log-distance model and by the prediction model (for links without a path, by the fallback), and as
+            the log-distance model and by the prediction model (for links without a path, by the fallback model), and as
             computed from the scene of the prediction model alone. Another column contains the change in path loss when
             the scene is traced again [dB]. If applicable, further columns are group, frequency [Hz], path loss with the
             nuisances alone [dB], values in the measured quantity, leverage, depth, and whether the link is censored or
@@ -328,7 +328,7 @@ class Record:
         """
         has_path = self.links["has_path"].to_numpy(bool)
         held_out = self.links["held_out"].to_numpy(bool)
-        # As in the objective, links without a path are used if a ceiling replaces the missing path loss.
+        # As in the objective, links without a path count as used if a ceiling replaces their missing path loss.
         usable = has_path | (self.study.objective.no_path == "censor")
         if "faint" in self.links:
             usable &= ~self.links["faint"].to_numpy(bool)
@@ -346,7 +346,7 @@ def check_record(result: object) -> None:
     """Refuse anything but a result.
 
     Raises:
-        InputError: The object is not a result; it may be a study, for example.
+        InputError: The object is not a result but, for example, a study.
     """
     if not isinstance(result, Record):
         raise InputError(

@@ -33,14 +33,14 @@ class ReasonKind(StrEnum):
     NOISE = "noise"  # change_db over the range, noise_db
     OUTSIDE_INTERVAL = "outside interval"  # value with the lowest RMSE
     TOO_FEW_LINKS = "too few links"  # links
-    # calls; error_db of predicting calls, and rmse_db of the best one, if the calls predict one another
+    # calls; error_db of predicting a call from the others, and rmse_db of the best call, if such predictions were made
     TOO_FEW_CALLS = "too few calls"
     NO_NOISE = "no noise"
     TOO_MANY_LINKS = "too many links"  # limit; the interval follows from the curvature
 
 
 class Cause(StrEnum):
-    """Possible causes of a wide interval, in addition to noise."""
+    """Possible causes of a wide interval, other than noise."""
 
     BUILDINGS = "buildings that differ"
     CORRELATION = "correlated errors"
@@ -57,7 +57,7 @@ class Reason:
     Attributes:
         kind: The kind of reason.
         values: Numbers and names that appear in the sentence; see `ReasonKind`.
-        ranges: Ranges or modes in the sentence; the last number of each range or mode is its weight.
+        ranges: Ranges or modes that appear in the sentence; the last number of each range or mode is its weight.
     """
 
     kind: ReasonKind
@@ -71,18 +71,19 @@ class Interval:
 
     Attributes:
         standard_error: Standard error from the curvature of the sum of squares at the optimum, in the parameter's unit.
-        lower: Lower end of the 95 % interval, within the bounds; if the interval has several pieces, the lower end of
-            the lowest.
-        upper: Upper end of the interval; if the interval has several pieces, the upper end of the highest.
+        lower: Lower end of the 95 % interval, within the bounds; if the interval consists of several separate ranges,
+            the lower end of the lowest range.
+        upper: Upper end of the 95 % interval, within the bounds; if there are several ranges, the upper end of the
+            highest range.
         verdict: The verdict on the parameter.
-        pieces: Lower and upper ends of all pieces, in ascending order; empty if the interval was not computed from
-            draws.
+        pieces: Lower and upper ends of all separate ranges that make up the interval, in ascending order; empty if the
+            interval was not computed from draws.
         reason: The reason for the verdict.
         approximate: Whether the interval was computed with an emulator, because the engine provides no derivatives.
-        seen: Pieces of the 95 % interval for only the buildings on the links' paths; these pieces apply to predictions.
-            The tuple is empty if these pieces equal those for the mean over all buildings of this material.
-        without: Share of the width that would remain if a cause were ruled out, by cause; causes with little effect are
-            omitted.
+        seen: The same as `pieces`, but for only the buildings on the links' paths; these ranges apply to predictions.
+            The tuple is empty if they equal the ranges for the mean over all buildings of this material.
+        without: Share of the interval's width that would remain if a cause were ruled out, by cause; causes with little
+            effect are omitted.
     """
 
     standard_error: float
@@ -101,7 +102,7 @@ class Interval:
         return f"{self.verdict}, approximate" if self.approximate else str(self.verdict)
 
     def contains(self, value: float, slack: float = 0.0) -> bool:
-        """Whether a value lies in one of the pieces, or within a distance `slack` of a piece."""
+        """Whether a value lies in the interval, or within a distance `slack` of it."""
         pieces = self.pieces or ((self.lower, self.upper),)
         return any(low - slack <= value <= high + slack for low, high in pieces)
 

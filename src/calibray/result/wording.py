@@ -16,10 +16,10 @@ MOST_ODDS: Final = 1000.0
 
 CLEAR_ODDS: Final = 2.0
 """Odds below which two candidates count as about equally probable. The log densities of draws of one Gaussian
-parameter have a standard deviation of sqrt(1/2), nearly ln 2."""
+parameter have a standard deviation of sqrt(1/2), which is close to ln 2."""
 
 SHOWN_PIECES: Final = 3
-"""Maximum number of interval pieces that are listed one by one."""
+"""Maximum number of separate ranges of an interval that are listed one by one."""
 
 SHOWN_GROUPS: Final = 4
 """Maximum number of groups that a remark lists."""
@@ -31,7 +31,7 @@ NOT_JUDGED: Final = f"{UNKNOWN_BEST} Set [holdout] blocks = 4, or run calibray v
 
 
 def interval_text(interval: Interval) -> str:
-    """The ends of an interval, or of each piece if there are few pieces, such as "2.1 to 3.4"."""
+    """The ends of an interval, such as "2.1 to 3.4", or of each of its separate ranges if there are only a few."""
     hull = ((interval.lower, interval.upper),)
     pieces = interval.pieces if 1 < len(interval.pieces) <= SHOWN_PIECES else hull
     return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
@@ -45,8 +45,7 @@ def reason_text(reason: Reason | None) -> str:
 def explanation_text(interval: Interval) -> str:
     """The reason for a verdict, and the assumptions that would narrow the interval.
 
-    The text consists of clauses without a full stop. The text is empty if there is neither a reason nor such an
-    assumption.
+    The text consists of clauses without a full stop, and is empty if there is neither a reason nor such an assumption.
     """
     clauses = [reason_text(interval.reason)]
     if interval.seen:
@@ -449,11 +448,11 @@ _BASELINES: Final[dict[str, str]] = {
     Model.LOG_DISTANCE: "a log-distance model",
     Model.OBSTRUCTION: "a log-distance model with obstruction",
 }
-"""Names of baselines for use within a sentence, if these names differ from those of the models."""
+"""Names of baselines for use within a sentence, where they differ from the names of the models."""
 
 
 def judgement_text(judgement: Judgement) -> str:
-    """State by how much calibration improves on the best baseline on held-out links, and how certain this is."""
+    """State by how much calibration improves on the best baseline on held-out links, and how certain this gain is."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')}"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
@@ -498,7 +497,7 @@ def unused_choice_text(chosen: str) -> str:
 
 
 def chosen_model_text(record: Record) -> str:
-    """State the held-out accuracy of the prediction model; empty if the prediction model is the calibrated model."""
+    """State the held-out accuracy of the prediction model; the text is empty if this is the calibrated model."""
     model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
     if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""
@@ -511,7 +510,7 @@ def chosen_model_text(record: Record) -> str:
 def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
     """All remarks about a result: warnings, advice, the judgement on held-out links, and the choice of the model.
 
-    `choice` is the reason for the prediction model, if validation chose it.
+    `choice` states why the prediction model was chosen, if validation chose it.
     """
     sentences = [
         remark_text(remark)
