@@ -45,7 +45,8 @@ from calibray.validation.validate import check_engine, validate_problem
 _LOG: Final = logging.getLogger(__name__)
 
 
-# Ctrl-C during an import leaves modules half initialized, and errors of these modules would hide the interruption.
+# Ctrl-C during an import leaves modules half initialized, and errors raised by these modules would hide the
+# interruption.
 @ensure_interruption()
 @unwrap_interruption()
 def calibrate(
@@ -68,11 +69,11 @@ def calibrate(
 
     Args:
         study: The study, which may already be open.
-        method: Method to use instead of the method of the study: "auto", "sgwo-im", "gwo", ...
-        seed: Seed to use instead of the seed of the study.
+        method: Method to use instead of that of the study: "auto", "sgwo-im", "gwo", ...
+        seed: Seed to use instead of that of the study.
         out: Folder to save the result in, which is checked before any computation. The ledger of RT calls is also
-            written to this folder, so that a restarted run does not repeat completed calls. Calls of a given `engine`
-            are not stored.
+            written to this folder, so that a restarted run does not repeat completed calls. If `engine` is given, its
+            calls are not stored.
         engine: Engine for all links of the study; if None, the engine that the study specifies. Predictions use the
             study's engine.
         workers: Workers from `engines.open_workers`, which run the calls of a batch (engine "command") or replay chunks
@@ -139,7 +140,7 @@ def calibrate(
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
     problem = with_preliminary_fits(problem, progress)
-    # The time to make the cheap model does not count as search time.
+    # The time taken to make the cheap model does not count as search time.
     paused = time.perf_counter()
     cheap, of_rays = CheapReplay(), ()
     if exporting is None:

@@ -2,8 +2,9 @@
 
 The fallback is a log-distance model with the study's nuisances. The fallback is fitted to the calibration links, like
 the log-distance baseline in validation. Links without a path are behind obstacles, so their path loss usually exceeds
-the prediction of the fallback. If enough links without a path were measured, or else enough links out of sight, their
-mean residual is added to the prediction. The scatter of these links then determines the errors of the fallback.
+the prediction of the fallback. If enough links without a path or, failing that, enough non-line-of-sight links were
+measured, their mean residual is added to the prediction. The scatter of their residuals then determines the errors of
+the fallback.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def on_held_out_links(
         errors = {name: (model - objective.measured)[judged] for name, model in modelled.items()}
         baselines = {name: errors[name] for name in BASELINES if name in errors}
         judgement = compare(errors[Model.CALIBRATED], baselines, moving_end(links)[judged])
-        # None if no link has a residual in every model.
+        # None if no link has a residual for every model.
         judgement = judgement if judgement.links else None
     name, residuals = _choice(problem, trail, modelled, judged)
     accuracy = Accuracy(
@@ -158,7 +159,7 @@ def _choice(
 def log_distance_errors(
     problem: Problem, models: Models, validation: Validation | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Residuals [dB] of the log-distance model on held-out links with a path [n], and a label for the residuals."""
+    """Residuals [n], [dB], of the log-distance model on held-out links with a path, and a label for the residuals."""
     if validation is not None:
         basis = f"errors on {len(validation.labels)} blocks held out in turn"
         return validation.errors[Model.LOG_DISTANCE][validation.judged], basis
@@ -199,12 +200,12 @@ def on_blocks(
 
 
 def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int64]) -> float:
-    """RMS over `links` [n] of the spread [dB] of random effects, for groups that occur in only one `block` [L]."""
+    """RMS spread [dB] of random effects over `links` [n], counting only groups that occur in a single `block` [L]."""
     return float(np.sqrt(np.mean(problem.objective.nuisance.new_group_spread(block)[links] ** 2)))
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """Ratio of the errors of links out of sight to the errors of all links; 1 if unknown or modelled by a nuisance."""
+    """Ratio of the RMS error of non-line-of-sight links to that of all links; 1 if unknown or if a nuisance models it."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
@@ -221,10 +222,10 @@ def fit_fallback(
 ) -> PredictionModel:
     """Fit the fallback, the log-distance model, to the calibration links.
 
-    The errors of the fallback come from links without a path. If too few links have no path, the errors come from links
-    out of sight, some of which are near the noise floor, like links without a path. If too few links are out of sight,
-    the residuals on held-out links [n], [dB], are used; `basis` describes them. Without enough held-out links, the
-    residuals on the calibration links are used.
+    The errors of the fallback are estimated from links without a path. If there are too few of these, they are
+    estimated from non-line-of-sight links, some of which are near the noise floor, as links without a path are. If
+    there are too few of these as well, the residuals on held-out links [n], [dB], are used; `basis` describes them.
+    Without enough held-out links, the residuals on the calibration links are used.
     """
     setup, links = problem.setup, problem.setup.links
     objective, known_db = log_distance(links, problem.objective, without_scene(setup.study, links))
@@ -233,7 +234,7 @@ def fit_fallback(
     measured = ~setup.held_out if links.censored is None else ~setup.held_out & ~links.censored
     usable, name = without_path & measured, WITHOUT_PATH
     usable = usable if problem.faint is None else usable & ~problem.faint
-    # Lines of sight take time to compute, so they are computed only if needed.
+    # Testing links for line of sight takes time, so this is done only if needed.
     if usable.sum() < FEW and OUT_OF_SIGHT in (table := setup.with_obstruction().links.table).frame:
         usable, name = (table.numbers(OUT_OF_SIGHT) > 0) & measured, OUT_OF_SIGHT.replace("_", " ")
     count = int(usable.sum())

@@ -39,8 +39,8 @@ from calibray.uncertainty.missing_region import missing_region
 from calibray.validation.held_out_statistics import CLUSTER_LINKS, MOST_CLUSTERS, spatial_blocks
 
 DENSE: Final = 20_000_000
-"""Maximum number of entries in the design matrix of the nuisances for which leverage is computed. A matrix of this size
-takes 160 MB."""
+"""Maximum number of entries in the nuisances' design matrix; if there are more, no leverage is computed. A matrix of
+this size takes 160 MB."""
 
 DIRECT: Final = "line of sight"
 """Label of the power share of paths without interactions."""
@@ -54,8 +54,8 @@ class LinkDiagnostics:
         columns: Columns for the table of links: `leverage` (NaN for a link of weight 0) and `depth`, the number of
             interactions of the strongest path (NaN for a link without a path).
         power_shares: Share of a link's power on paths with a given material and kind of interaction, averaged over the
-            links. A path counts in full for every pair of material and kind on the path, so the sum of the shares can
-            exceed 1.
+            links. A path counts in full for every pair of material and kind of interaction on the path, so the sum of
+            the shares can exceed 1.
     """
 
     columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -94,7 +94,7 @@ def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | N
 
 
 def _at_one_carrier(problem: Problem) -> bool:
-    """Whether all paths are replayed without compression, at the constants of the study's carrier."""
+    """Whether all paths are replayed without compression, with the constants at the study's carrier."""
     compressed = getattr(problem.setup.study.engine, "compress_db", None) is not None
     return not (compressed or problem.parameters.has_laws or problem.setup.links.frequency is not None)
 
@@ -118,7 +118,7 @@ def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leverage of each link [m]: the derivative of its modelled value with respect to its own measurement.
+    """Leverage of each of m links: the derivative of its modelled value with respect to its own measurement.
 
     Leverage is the diagonal of the projection onto two sets of columns: the derivatives of the residuals, with the
     nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. Leverage is 0 for a
@@ -184,8 +184,8 @@ FEWEST_CLUSTERS: Final = 8
 tested."""
 
 MIXED: Final = 0.5
-"""Minimum share of the variance of group membership within clusters for a group to be tested; a group with a smaller
-share is a location."""
+"""Minimum share of the variance of group membership that must lie within clusters for the group to be tested; a group
+with a smaller share is regarded as a location."""
 
 SIGNIFICANCE: Final = 0.01
 """Probability of a false alarm over all groups of all columns, or over all antenna directions."""
@@ -204,8 +204,7 @@ class Difference:
         label: Label of the group in this column.
         difference_db: Mean residual of the group minus the mean residual of its neighbours [dB].
         error_db: Standard error [dB].
-        chance: Probability that chance alone causes a difference at least as significant, times the number of tested
-            groups.
+        chance: P-value of the difference, multiplied by the number of tested groups.
     """
 
     column: str
@@ -218,7 +217,7 @@ class Difference:
 def differing_groups(
     residual_db: NDArray[np.float64], ends: NDArray[np.float64], columns: Mapping[str, NDArray[np.str_]]
 ) -> list[Difference]:
-    """Find groups, such as the links of one device, whose residuals differ significantly from residuals of neighbours.
+    """Find groups, such as the links of one device, whose residuals differ significantly from those of neighbours.
 
     Only neighbouring links of one transmitter are compared: residuals and group membership are taken relative to their
     means over clusters of neighbouring links. A column that is constant over a neighbourhood, such as the name of a
@@ -232,7 +231,7 @@ def differing_groups(
         columns: Labels [n] by column.
     """
     count = min(max(len(ends) // CLUSTER_LINKS, 1), MOST_CLUSTERS)
-    # Transmitter positions are scaled up, so clusters rarely contain links of two transmitters.
+    # Transmitter positions are scaled up, so that clusters rarely contain links of two transmitters.
     cluster = spatial_blocks(ends * np.repeat([1000.0, 1.0], 3), count)
     size = np.bincount(cluster)
     residual = residual_db - (np.bincount(cluster, residual_db) / size)[cluster]
@@ -308,7 +307,7 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
 
 
 def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) -> int:
-    """Number of links in the sample that have a path when the tracer settings are changed."""
+    """Number of links in the sample that have a path with the changed tracer settings."""
     mask = np.isin(np.arange(len(setup.links)), sample)
     changed = setup.with_trace(replace(setup.study.trace, **change))
     paths = changed.at(setup.links.select(mask)).trace()
@@ -316,14 +315,14 @@ def _reached(setup: Setup, sample: NDArray[np.int64], change: dict[str, Any]) ->
 
 
 MOST_NUMBERS: Final = 12
-"""Maximum number of distinct values in a numeric column, such as days or floors, whose values can label groups."""
+"""Maximum number of distinct values with which a numeric column, such as the day or the floor, can label groups."""
 
 SIGNAL_CORRELATION: Final = 0.5
 """Magnitude of the rank correlation with path loss above which whole numbers are assumed to be signal levels, not
 labels."""
 
 FEWEST_OF_TRANSMITTER: Final = 2 * LINKS_PER_UNKNOWN
-"""Minimum number of links for which the direction of a transmitter is tested; a direction has two angles."""
+"""Minimum number of links of a transmitter for its direction to be tested; a direction has two unknown angles."""
 
 MOST: Final = 50
 """Maximum number of transmitters that are tested; those with the most links are chosen. Each transmitter requires three
@@ -340,9 +339,9 @@ class Direction(NamedTuple):
 
 
 def region_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
-    """Test whether losses in a region, such as one with unmapped trees, would explain the residuals of a calibration.
+    """Test whether losses in a region, for example due to unmapped trees, would explain the residuals of a calibration.
 
-    The links must have positions. A common loss of links out of sight is fitted first.
+    The links must have positions. A loss that is common to all non-line-of-sight links is fitted first.
     """
     links = problem.setup.links
     if not isinstance(links, Measurements) or not problem.differentiable:
@@ -405,7 +404,7 @@ def groups_remark(problem: Problem, trail: Trail) -> tuple[Remark, ...]:
 
 
 def _are_labels(cells: pd.Series, path_loss_db: NDArray[np.float64]) -> bool:
-    """Whether numbers can be labels of groups rather than signal levels."""
+    """Whether numbers can be group labels rather than signal levels."""
     if cells.dtype.kind == "c" or not 2 <= cells.nunique() <= MOST_NUMBERS or (cells % 1 != 0).any():
         return False
     correlation = cells.corr(pd.Series(path_loss_db, cells.index), method="spearman")
@@ -455,7 +454,7 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
 def _derivatives(
     problem: Problem, engine: Replay | Chunked, best: NDArray[np.float64], transmitters: list[str]
 ) -> tuple[Evaluation, dict[str, int]]:
-    """The evaluation, with derivatives for the transmitters' directions and gains, and the column of each parameter."""
+    """The evaluation with derivatives for the directions and gains of the transmitters, and each parameter's column."""
     content = problem.setup.study.content()
     poses = {
         f"{POSE}{label}.{field}": {"bounds": [-1.0, 1.0], "start": 0.0}
@@ -494,7 +493,7 @@ class _Posed:
 def _direction(
     evaluation: Evaluation, columns: dict[str, int], label: str, freedom: int, significance: float
 ) -> Direction | None:
-    """The change of direction that explains the residuals of one transmitter; None if the change is not significant."""
+    """The change in direction that explains the residuals of one transmitter; None if it is not significant."""
     residuals, slopes = evaluation.residuals[0], evaluation.slopes[0]
     own = [columns[f"{POSE}{label}.{field}"] for field in ("azimuth", "downtilt", "gain")]
     common = [column for name, column in columns.items() if not name.startswith(POSE)]

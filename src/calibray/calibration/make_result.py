@@ -67,7 +67,7 @@ FAINT: Final = "predicted too near the noise floor, left out"
 
 @dataclass(frozen=True)
 class Timing:
-    """Durations of the search and of the preceding loading and tracing, and the start time of the run [s]."""
+    """Durations [s] of the search and of the loading and tracing before it, and the start time [s] of the run."""
 
     search: float
     trace: float
@@ -81,8 +81,8 @@ class Run:
     Attributes:
         problem: The problem, with the paths of the last trace.
         trail: The search.
-        retrace_gap_db: Change of every link's path loss when the scene is traced again [links], [dB]; None if the scene
-            is not traced again.
+        retrace_gap_db: Change in every link's path loss [links], [dB], when the scene is traced again; None if it is
+            not traced again.
         cheap: The cheap model, if the method used one.
         enclosed: Antennas inside closed bodies; None if the antennas were not checked.
         on_links: Remarks on ray mapping, links without a path, antenna directions, missing regions and groups of links.
@@ -288,14 +288,14 @@ def _worse_than_mean(problem: Problem, found_db: float, log_distance_db: float) 
 
 
 def _not_judged(study: StudyModel, accuracy: Accuracy) -> tuple[Remark, ...]:
-    """A remark that no link was held out, if the study allows blocks to be held out."""
+    """A remark that no link was held out, made if the study allows blocks to be held out."""
     if accuracy.judgement is None and study.allows_blocks:
         return (Remark(RemarkKind.NOT_JUDGED),)
     return ()
 
 
 def _faint_rows(problem: Problem) -> dict[str, int]:
-    """Number of links above the noise floor that are left out because the model predicts them near the noise floor."""
+    """Number of links measured above the noise floor that are left out because the model predicts them near it."""
     faint, censored = problem.faint, problem.setup.links.censored
     count = 0 if faint is None else int((faint if censored is None else faint & ~censored).sum())
     return {FAINT: count} if count else {}
@@ -338,7 +338,7 @@ def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
 
 
 def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
-    """Columns that describe the obstruction of the straight line between the ends of each link."""
+    """Columns that describe the obstruction of each link's line of sight."""
     table = setup.with_obstruction().links.table
     names = (OUT_OF_SIGHT, "obstruction_m", *([REGION] if setup.study.regions else []))
     return {name: table.numbers(name) for name in names}
@@ -372,7 +372,7 @@ def observable_fits(
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
     """The fit of every further observable by name, and the columns of the observables in the table of links.
 
-    The columns are the measured, initial and calibrated values and the biases [L], in the unit of the observable.
+    The columns [L] are the measured, initial and calibrated values and the biases, in the unit of the observable.
     `draws` contains the posterior draws by parameter and may be empty.
     """
     problem = run.problem
@@ -397,7 +397,7 @@ def observable_fits(
             if spread
             else biases
         )
-        # The standard error of the mean, combined with the error due to the parameters.
+        # The standard error of the mean, combined with the error due to the uncertainty of the parameters.
         errors = np.sqrt(
             observable.std**2 / np.maximum(count, 1) + np.mean((of_draws - biases)[:, groups] ** 2, axis=0)
         )

@@ -41,7 +41,7 @@ class Result(Record):
 
     @classmethod
     def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
-        """Read a result that `save` wrote; with `allow_changed_inputs`, also a result whose files were edited.
+        """Read a result that `save` wrote; with `allow_changed_inputs`, its files may have been edited.
 
         Raises:
             InputError: The folder contains no result, or the result was written by another version, is damaged, or was
@@ -95,14 +95,14 @@ class Result(Record):
                 position columns that the study names, and the study's group column, if any. The study's frequency
                 column contains the carriers; without this column, all links have the scene's carrier.
             progress: Called with the stage "tracing" after every launch.
-            allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
+            allow_changed_inputs: Predict even if a scene or antenna file has changed since the calibration.
 
         Returns:
             Path loss with nuisances [links], [dB]; for a link without a path, the prediction of the fallback.
 
         Raises:
-            InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
-                the scene or an antenna has changed since the calibration.
+            InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a scene or
+                antenna file has changed since the calibration.
         """
         from calibray.prediction.predict import predict
 
@@ -122,7 +122,7 @@ class Result(Record):
             links: The links, or a table, as for `predict`; groups without measurements are allowed.
             level: Probability that a measurement lies in the interval.
             progress: Called with the stage "tracing" after every launch.
-            allow_changed_inputs: Predict even if a file of the scene or an antenna has changed since the calibration.
+            allow_changed_inputs: Predict even if a scene or antenna file has changed since the calibration.
 
         Returns:
             One row per link, with the index of the table: path_loss_db, lower_db and upper_db [dB]; the same three

@@ -1,4 +1,4 @@
-"""Predict many links with bounded memory, batch by batch, and in chunks on workers that do not return paths."""
+"""Predict many links with bounded memory: batch by batch, and in chunks on workers, which do not return paths."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _Task:
 
 
 def batch_size(setup: Setup, workers: Workers | None) -> int:
-    """Number of links to predict together; with this limit, memory use does not depend on the total number of links."""
+    """Number of links to predict together, limited so that memory use does not depend on the total number of links."""
     if workers is not None:
         return CHUNKS_PER_BATCH * _chunk_size(setup)
     return DIFFUSE_BATCH if setup.study.trace.diffuse_reflection else BATCH
@@ -160,7 +160,7 @@ LOG: Final = logging.getLogger(__name__)
 
 
 def announce(result: Record, links: int, what: str = "links") -> None:
-    """Log the number of links to trace and the approximate duration of the trace."""
+    """Log how many links are to be traced, and approximately how long this will take."""
     counted = f"{links:,} {what.removesuffix('s') if links == 1 else what}"
     if result.prediction.model.parameters is None:
         LOG.info("%s, predicted without a trace: the log-distance model uses no scene", counted)
@@ -184,8 +184,9 @@ def announce(result: Record, links: int, what: str = "links") -> None:
 def _seconds(result: Record, links: int) -> float:
     """Estimated duration of a trace [s].
 
-    If the calibration read its trace from the cache, its tracing time is too short, so the estimate is at least that
-    from the number of rays. If rays are added until path loss converges, the number of rays is not known in advance.
+    If the calibration read its trace from the cache, the recorded tracing time is too short. The estimate is therefore
+    no shorter than the time that follows from the number of rays. If rays are added until path loss converges, the
+    number of rays is not known in advance.
     """
     settings = result.study.trace
     lanes = 0 if settings.adaptive else settings.rays * max(settings.max_depth, 1) * links

@@ -4,9 +4,9 @@ The nuisance is uncertain for groups without measurements. For a link without a 
 the path loss and the interval, and the prediction is marked.
 
 The residual field is the spatially correlated part of the calibration residuals, kriged to nearby links. Clutter that
-is missing from the scene affects neighbouring links in the same way, so the residual near a measured link is partly
-known. The correlated part has an exponential covariance. The range and variance of this covariance maximize the
-restricted likelihood (`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the kriged
+is missing from the scene affects neighbouring links in the same way, so the residual of a new link near a measured link
+is partly known. The correlated part has an exponential covariance. The range and variance of this covariance maximize
+the restricted likelihood (`uncertainty.residual_correlation.fit_correlation`). Far from all measured links, the kriged
 field is zero.
 """
 
@@ -34,11 +34,11 @@ from calibray.validation.held_out_statistics import interval_half_width
 from calibray.validation.models import without_scene
 
 MOST_EXACT: Final = 1000
-"""Maximum number of measured links for which kriging uses all of them at every new link; with more measured links, only
-the nearest are used."""
+"""Number of measured links up to which kriging uses all of them at every new link. If there are more, it uses only the
+nearest."""
 
 NEAREST: Final = 50
-"""Number of nearest measured links that kriging uses at each new link."""
+"""Number of nearest measured links from which kriging predicts each new link."""
 
 TOGETHER: Final = 500
 """Number of new links for which the kriging equations are solved together; each link needs about 150 kB of memory."""
@@ -46,11 +46,11 @@ TOGETHER: Final = 500
 
 @dataclass(frozen=True, eq=False)
 class TermAtLinks:
-    """A fitted nuisance term, evaluated at new links.
+    """A fitted nuisance term, evaluated on new links.
 
     Attributes:
         name: Name of the term.
-        column: Values of the term's column minus the term's centre [links].
+        column: Values in the term's column [links], minus the term's centre.
         labels: Labels of the links' groups [links]; None for a term without groups.
         coefficients: Coefficient by group, [dB] per unit of the column.
         spread_db: Standard deviation between groups, in the unit of the coefficients; if None, the standard deviation
@@ -68,10 +68,9 @@ class Shift(NamedTuple):
     """The contribution of the nuisance to path loss.
 
     Attributes:
-        value_db: Contribution with the best coefficients, followed by the contribution with each draw [1 + draws,
-            links], [dB].
-        spread_db: Standard deviation of the contribution for links whose group has no coefficient; 0 for other links
-            [links], [dB].
+        value_db: Contribution [1 + draws, links], [dB], with the best coefficients, followed by that with each draw.
+        spread_db: Standard deviation of the contribution [links], [dB], if the link's group has no coefficient;
+            otherwise 0.
     """
 
     value_db: NDArray[np.float64]
@@ -79,7 +78,7 @@ class Shift(NamedTuple):
 
 
 def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
-    """Evaluate the nuisance terms of the prediction model at new links.
+    """Evaluate the nuisance terms of the prediction model on new links.
 
     Yields:
         Each term with the values of its column and the groups of the links.
@@ -159,10 +158,10 @@ def fill_missing(
     level: float | None = None,
     least_db: NDArray[np.float64] | float = 0.0,
 ) -> pd.DataFrame:
-    """Fill in a table of predictions for links without a path, using the fallback model.
+    """Fill in the rows of links without a path in a table of predictions, using the fallback model.
 
     The columns are path_loss_db (infinite without a path), basis and, with a level, lower_db and upper_db. `least_db`
-    is half the width of the prediction model's interval [links], [dB]; the fallback's interval is at least as wide.
+    [links], [dB], is half the width of the prediction model's interval; the fallback's interval is at least as wide.
     """
     missing = ~np.isfinite(table["path_loss_db"].to_numpy(float))
     if not missing.any():
@@ -197,11 +196,12 @@ def krige_residuals(
     residuals: NDArray[np.float64],
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Krige the residual field from measured links to new links; positions are those of both ends [m, 6], [n, 6], [m].
+    """Krige the residual field from m measured links to n new links.
 
-    `residuals` [m] are the measured minus the modelled path loss [dB]. The results are the correction of the modelled
-    path loss [n], [dB], and the share of the field's variance that the measured links explain [n]. This share is 0 far
-    from all measured links, and less than 1 near a measured link.
+    `measured` [m, 6] and `position` [n, 6] contain the positions of both ends of each link, in metres. `residuals` [m]
+    are the measured minus the modelled path loss [dB]. The results are the correction [n], [dB], of the modelled path
+    loss, and the share [n] of the field's variance that the measured links explain. This share is 0 far from all
+    measured links, and less than 1 near a measured link.
     """
     if len(measured) <= MOST_EXACT:
         return _krige(field, measured, residuals, position)
@@ -239,7 +239,7 @@ def _krige(
 
 
 def calibration_residuals(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the calibration links with a path [m], and their measured minus predicted path loss [m], [dB]."""
+    """Find the indices [k] of calibration links with a path, and their measured minus predicted path loss [k], [dB]."""
     modelled = links["predicted_db"].to_numpy(float)
     counted = links["has_path"].to_numpy(bool) & ~links["held_out"].to_numpy(bool) & np.isfinite(modelled)
     if "faint" in links:

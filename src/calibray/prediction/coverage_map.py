@@ -1,8 +1,8 @@
 """Coverage maps: path loss over an area, predicted with the calibrated scene, with prediction intervals.
 
-Path loss to the centre of each cell is predicted as for any other link. Sionna's radio map solver instead averages over
-the rays that cross each cell. In the demo district, the two methods differ by more than 0.05 dB in 70 % of the cells,
-and by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
+Path loss to the centre of each cell is predicted in the same way as for any other link. Sionna's radio map solver
+instead averages over the rays that cross each cell. In the demo district, the results of the two methods differ by more
+than 0.05 dB in 70 % of the cells, and by more than 0.7 dB in 10 % (`python benchmarks/coverage_map.py --solver`).
 """
 
 from __future__ import annotations
@@ -63,25 +63,24 @@ def coverage_map(
 
     Args:
         result: The calibration.
-        tx: Position of the transmitter [3], [m]; if None, the position of the calibration's only transmitter.
+        tx: Position of the transmitter [3], [m]; if None, that of the calibration's only transmitter.
         height: Height of the receivers above the ground or, where the scene has no ground, above the scene's lowest
             point [m].
         cell: Width of the cells [m]; the receivers are at their centres.
         bounds: West, south, east and north bounds of the area [4], [m]; if None, the bounds of the scene.
-        level: Probability that the interval contains a measurement; None for no interval.
+        level: Probability that the interval contains a measurement; if None, no interval is computed.
         power_dbm: Transmitted power, for a map of received power [dBm]; if None, the map shows path loss. After a
             calibration on RSRP, the default is 0, because the offset contains the transmitted power.
         samples: Number of rays; if None, the number in the study. Too few rays miss paths; the computing time is
             proportional to the number of rays. "auto" adds rays until path loss converges, which is faster than using a
             large number of rays from the start.
-        columns: Values, for this transmitter, of the study's columns for groups, carriers or nuisances, by column name.
-            The offset group is taken from the links measured at this transmitter if these links all belong to the same
-            group.
+        columns: Values that the study's columns for groups, carriers or nuisances have for this transmitter, keyed by
+            column name. If all links measured at this transmitter belong to the same offset group, this group is the
+            default.
         progress: Function that is called with the stage "tracing" after every launch of rays.
         workers: Workers that trace and predict chunks of cells (see `engines.open_workers`); if None, this process does
             the work.
-        allow_changed_inputs: If True, predict even if a file of the scene or an antenna has changed since the
-            calibration.
+        allow_changed_inputs: If True, predict even if a scene or antenna file has changed since the calibration.
 
     Raises:
         InputError: An argument is invalid, a column is missing, the map would have more than a million cells, or
@@ -113,7 +112,7 @@ def coverage_map(
             "from RSRP by %+g dB; to map RSRP, omit the power", power_dbm, power_dbm,
         )  # fmt: skip
     frame = known_frame(study)
-    # Before the grid is known, the study is opened with a single link, to a receiver 1 m above the transmitter.
+    # Until the grid is known, the study is opened with a single link, to a receiver 1 m above the transmitter.
     one_link = pd.DataFrame({**position_columns(transmitter, transmitter[None] + np.eye(3)[2]), **constants})
     setup = open_for_links(result, as_links(result, one_link), allow_changed_inputs=allow_changed_inputs)
     triangles = read_triangles(setup.scene)
@@ -167,7 +166,7 @@ def coverage_map(
 
 
 def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float64]:
-    """The given transmitter position or, if none is given, that of the calibration's only transmitter [3], [m]."""
+    """The given position [3], [m], of the transmitter or, if None, that of the calibration's only transmitter."""
     if tx is not None:
         position = _numbers(tx)
         if position.shape != (3,) or not np.isfinite(position).all():
@@ -225,7 +224,7 @@ def _column_values(
 def _measured_values(
     study: Study, tx: NDArray[np.float64], columns: Sequence[str], stated: Mapping[str, object]
 ) -> dict[str, object]:
-    """Values of columns, such as antennas and carriers, that all links measured at this transmitter have in common."""
+    """Column values, such as antennas and carriers, that all links measured at this transmitter have in common."""
     if not set(columns) - set(stated):
         return {}
     links = study.measurements()
@@ -247,7 +246,7 @@ def _measured_values(
 def _grid(
     triangles: Triangles, bounds: Sequence[float] | None, cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Eastings and northings of the cells' centres [nx], [ny], [m]."""
+    """Eastings [nx] and northings [ny] of the cells' centres [m]."""
     if bounds is None:
         if not len(triangles.face):
             raise InputError("the scene has no readable mesh, so its area is unknown; give --bounds")

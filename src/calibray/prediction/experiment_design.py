@@ -2,7 +2,7 @@
 
 The posterior draws represent the possible parameter values. Each draw in turn is assumed to be the true value, and the
 other draws are weighted by how well they agree with the measurement that this value would produce. A candidate is
-ranked by the mean logarithm of the remaining standard deviations over draws and parameters (an A-optimal design in
+ranked by the logarithm of the remaining standard deviations, averaged over draws and parameters (an A-optimal design in
 relative units, averaged over the posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review,
 Statistical Science 10, 1995). The standard deviations are computed in two ways, and their logarithms are added:
 
@@ -11,14 +11,14 @@ Statistical Science 10, 1995). The standard deviations are computed in two ways,
 - from the curvature at each draw, which shows by how much a measurement narrows a single minimum.
 
 The scatter is uninformative if a range of a parameter contains few draws. If several separate ranges of a parameter fit
-the links, the probability of ruling out all but one of these ranges is therefore added to the rank. Each range contains
-values that explain the links measured so far. The excess of a value is its sum of squares minus the sum of squares of
-the best value. For a candidate, the squared difference between the predictions of this value and of the true value is
-added to the excess. The smallest total in a range is the sum of squares that a fit within this range would reach with
-all other parameters free. A range is ruled out if its smallest total exceeds that of the true range by more than the
-quantile used for intervals. For two models, this criterion is the T-optimal design (A. C. Atkinson and V. V. Fedorov,
-The design of experiments for discriminating between two rival models, Biometrika 62, 1975) with an expectation over the
-true value (G. E. P. Box and W. J. Hill, Discrimination among mechanistic models, Technometrics 9, 1967).
+the links, the probability of ruling out all but one of these ranges is therefore included in the ranking. Each range
+contains values that explain the links measured so far. The excess of a value is its sum of squares minus the sum of
+squares of the best value. For a candidate, the squared difference between the predictions of this value and of the true
+value is added to the excess. The smallest total in a range is the sum of squares that a fit within this range would
+reach with all other parameters free. A range is ruled out if its smallest total exceeds that of the true range by more
+than the quantile used for intervals. For two models, this criterion is the T-optimal design (A. C. Atkinson and V. V.
+Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975) with an expectation
+over the true value (G. E. P. Box and W. J. Hill, Discrimination among mechanistic models, Technometrics 9, 1967).
 
 Candidates are chosen one at a time. Part of the error is common to several candidates, because of an unknown offset or
 shared clutter. Conditioning after each choice removes this common part, so a second measurement at the same point adds
@@ -40,19 +40,19 @@ UNIFORM_INFORMATION: Final = 12.0
 measurement."""
 
 LEAST_VARIANCE: Final = 1e-5
-"""Variance in the unit cube below which the scatter of about a hundred draws has no resolution."""
+"""Smallest variance in the unit cube that the scatter of about a hundred draws can resolve."""
 
 SEPARATION_WEIGHT: Final = 8.0
 """Weight of ruling out all but one range of a parameter, relative to narrowing the parameter by a factor of e."""
 
 RULED_OUT: Final = 4.3
-"""Excess of the sum of squares above which a range is ruled out, in noise variances: F(0.95; 1, about 20)."""
+"""Excess of the sum of squares, in noise variances, above which a range is ruled out: F(0.95; 1, about 20)."""
 
 EXCESS_DEVIATION: Final = 3.0
-"""Standard deviation of the excess that the noise of the candidates' measurements causes, in noise variances."""
+"""Standard deviation of the excess, in noise variances, due to the noise of the candidates' measurements."""
 
 BATCH: Final = 4_000_000
-"""Maximum number of values per batch (draws times values times candidates); it limits memory use."""
+"""Maximum number of array elements per batch (draws times values times candidates), which limits memory use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,8 @@ class Errors:
 
     Attributes:
         own_db: Standard deviation of the part of a candidate's error that is independent of other candidates [dB].
-        common: Change in path loss per standard deviation of each common unknown [candidates, unknowns], [dB].
+        common: Change in path loss [candidates, unknowns], [dB], per standard deviation of each unknown that is common
+            to several candidates.
         position: Positions of the receivers, or of both ends [candidates, k], [m].
         shared_db: Standard deviation of the part of the error that neighbouring candidates share [dB]; 0 if they share
             none.
@@ -80,7 +81,7 @@ class Errors:
         return self.own_db**2 + self.shared_db**2 + np.sum(self.common**2, axis=1)
 
     def covariance(self, index: int) -> NDArray[np.float64]:
-        """Covariance of one candidate's error with the errors of all candidates [candidates], [dB^2]."""
+        """Covariance [candidates], [dB^2], of one candidate's error with the errors of all candidates."""
         covariance = self.common @ self.common[index]
         if self.shared_db:
             distance = cdist(self.position, self.position[index : index + 1])[:, 0]
@@ -95,11 +96,12 @@ class Outlook:
 
     Attributes:
         index: The candidate.
-        narrowed: Standard deviation of every parameter, relative to that before any candidate is measured [d]; at most
+        narrowed: Standard deviation [d] of every parameter, relative to that before any candidate is measured; at most
             1.
-        range_probability: Probability that it is known in which of its separate ranges a parameter lies [d]; 1 if there
-            is only one range.
-        information: Information matrix of all links measured up to this candidate, at every draw [n, d, d].
+        range_probability: Probability [d] that it is known in which of its separate ranges a parameter lies; 1 if it
+            has only one range.
+        information: Information matrix [n, d, d], at every draw, of all links measured up to and including this
+            candidate.
     """
 
     index: int
@@ -114,10 +116,10 @@ class Beliefs:
 
     Attributes:
         point: Draws from the posterior in the unit cube [n, d].
-        information: Information matrix of the links measured so far, at every draw [n, d, d].
-        piece: Index of the separate range in which each parameter lies [m, d], first for the draws, then for further
+        information: Information matrix [n, d, d], at every draw, of the links measured so far.
+        piece: Index [m, d] of the separate range in which each parameter lies, first for the draws, then for further
             values that explain the links measured so far.
-        excess: Sum of squares of each draw and each further value, minus the smallest sum, in noise variances [m].
+        excess: Sum of squares [m] of each draw and each further value, minus the smallest sum, in noise variances.
     """
 
     point: NDArray[np.float64]
@@ -133,9 +135,9 @@ def choose_candidates(
 
     Args:
         beliefs: The state of the calibration.
-        predicted: Path loss of the candidates for each draw and each further value [m, candidates], [dB].
-        slope: Derivatives of path loss with respect to the coordinates of the unit cube, at the draws [n, candidates,
-            d], [dB].
+        predicted: Path loss [m, candidates], [dB], of the candidates for each draw and each further value.
+        slope: Derivatives of path loss [n, candidates, d], [dB], with respect to the coordinates of the unit cube, at
+            the draws.
         errors: Expected errors of the measurements.
         count: Number of candidates to choose.
 
@@ -147,13 +149,13 @@ def choose_candidates(
     beliefs = replace(beliefs, information=beliefs.information + prior_information)
     predicted, slope, variance = predicted.copy(), slope.copy(), errors.variance.copy()
     draws = len(beliefs.point)
-    # Squared differences between draws and values at the chosen candidates, in error variances.
+    # Squared differences between the predictions of draws and values for the chosen candidates, in error variances.
     squares = np.zeros((draws, len(predicted)))
     taken = np.zeros(len(variance), dtype=bool)
     conditioned, outlooks = np.zeros((0, len(variance))), []
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
-    # If draws scatter less than the curvature implies, a prior narrows them that the information matrices do not
-    # include.
+    # If draws scatter less than the curvature implies, they are narrowed by a prior that the information matrices do
+    # not include.
     scale = np.minimum(before / _by_curvature(beliefs.information), 1.0)
     narrowed = np.ones(len(before))
     for _ in range(min(count, len(variance))):
@@ -192,7 +194,7 @@ def choose_candidates(
 def initial_range_probability(piece: NDArray[np.int64]) -> NDArray[np.float64]:
     """Probability [d] that two draws lie in the same range of a parameter, before any candidate is measured.
 
-    `piece` is the index of the range in which each parameter of each draw lies [n, d].
+    `piece` [n, d] is the index of the range in which each parameter of each draw lies.
     """
     return _range_probability(piece, np.zeros((len(piece), len(piece))))
 
@@ -203,13 +205,13 @@ def separation_probability(
     squares: NDArray[np.float64],
     predicted: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Probability of ruling out all but one range of a parameter by measuring a candidate [candidates].
+    """Probability [candidates] that measuring a candidate rules out all but one range of a parameter.
 
-    The probability is averaged over draws and parameters; a parameter with a single range contributes 0. `excess` is
-    the sum of squares of every value minus the smallest sum, in noise variances [m]; the first n values are the draws.
-    `piece` is the index of each parameter's range [m, d]. `squares` contains squared differences between draws and
-    values at the candidates chosen so far [n, m]. `predicted` is the path loss of the candidates for every value, in
-    standard deviations of their errors [m, candidates].
+    The probability is averaged over draws and parameters; a parameter with a single range contributes 0. `excess` [m]
+    is the sum of squares of every value minus the smallest sum, in noise variances; the first n values are the draws.
+    `piece` [m, d] is the index of each parameter's range. `squares` [n, m] contains the sums of squared differences
+    between the predictions of draws and values for the candidates chosen so far. `predicted` [m, candidates] is the
+    path loss of the candidates for every value, in standard deviations of the candidates' errors.
     """
     draws, candidates = len(squares), predicted.shape[1]
     ambiguous = [column for column in piece.T if np.ptp(column)]
@@ -225,7 +227,7 @@ def separation_probability(
 
 
 def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Probability that all ranges but that of the true draw are ruled out [n, c], given sums of squares [n, m, c]."""
+    """Probability [n, c] that all ranges but that of the true draw are ruled out, given sums of squares [n, m, c]."""
     ranges, value_range = np.unique(piece, return_inverse=True)
     # The sum of squares of the best fit in each range.
     least = np.stack([total[:, value_range == k].min(axis=1) for k in range(len(ranges))])
@@ -238,13 +240,13 @@ def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> N
 def _rank_by_scatter(
     point: NDArray[np.float64], squares: NDArray[np.float64], predicted: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Mean logarithm of the draws' standard deviations after a candidate is measured [candidates]."""
+    """Mean logarithm [candidates] of the draws' standard deviations after a candidate is measured."""
     draws, candidates = predicted.shape
     rank, size = np.empty(candidates), max(BATCH // draws**2, 1)
     for start in range(0, candidates, size):
         batch = predicted[:, start : start + size].T
         weight = _weights(squares + (batch[:, :, None] - batch[:, None, :]) ** 2)
-        # Moments of the draws, assuming that the draw of each row is the true value.
+        # Moments of the draws; each row assumes that its own draw is the true value.
         mean = weight @ point
         variance = np.maximum(weight @ point**2 - mean**2, 0.0)
         rank[start : start + size] = 0.5 * np.log(variance + LEAST_VARIANCE).mean(axis=(1, 2))
@@ -252,7 +254,7 @@ def _rank_by_scatter(
 
 
 def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean logarithm of the standard deviations implied by curvature, after a candidate is measured [candidates]."""
+    """Mean logarithm [candidates] of the standard deviations implied by curvature, after a candidate is measured."""
     covariance = np.linalg.inv(information)
     # The Sherman-Morrison formula gives the inverse after one row of slopes is added.
     gain = slope @ covariance
@@ -263,14 +265,14 @@ def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float
 
 
 def _scatter(point: NDArray[np.float64], squares: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected standard deviation of every parameter [d], from the scatter of the weighted draws."""
+    """Expected standard deviation [d] of every parameter, computed from the scatter of the weighted draws."""
     weight = _weights(squares)
     variance = weight @ point**2 - (weight @ point) ** 2
     return np.sqrt(np.maximum(variance, 0.0)).mean(axis=0)
 
 
 def _by_curvature(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expected standard deviation of every parameter [d], from the information matrices at the draws."""
+    """Expected standard deviation [d] of every parameter, computed from the information matrices at the draws."""
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)).mean(axis=0)
 
 

@@ -1,4 +1,4 @@
-"""A coverage map and the files that it is written to: GeoTIFF, picture and table."""
+"""A coverage map, and the files to which it is written: GeoTIFF, picture and table."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class CoverageMap:
         power_dbm: Transmitted power for a map of received power [dBm]; None for a map of path loss.
         frame: Geographic frame of the scene; None if unknown.
         triangles: The scene, used for drawing.
-        observables: Further observables of the study [ny, nx], by name including the unit, such as spread_ns.
+        observables: Further observables of the study [ny, nx], keyed by name and unit, such as spread_ns.
     """
 
     tx: NDArray[np.float64]
@@ -89,12 +89,12 @@ class CoverageMap:
 
     @property
     def layers(self) -> dict[str, NDArray[np.float64]]:
-        """The mapped quantity, path loss [dB] or received power [dBm], and its interval; arrays [ny, nx] by name."""
+        """The mapped quantity (path loss [dB] or received power [dBm]) and its interval, as arrays [ny, nx] by name."""
         if self.power_dbm is None:
             best = {"path_loss_db": self.path_loss_db}
             interval = {"lower_db": self.lower_db, "upper_db": self.upper_db}
         else:
-            # The upper end of path loss is the lower end of power.
+            # The upper end of the path-loss interval is the lower end of the power interval.
             best = {"received_power_dbm": self.power_dbm - self.path_loss_db}
             interval = {
                 "lower_dbm": self.power_dbm - self.upper_db,
@@ -123,7 +123,7 @@ class CoverageMap:
             Names of the files that were written; without rasterio, there is no GeoTIFF.
 
         Raises:
-            InputError: The folder cannot be written, or a file there must not be replaced.
+            InputError: The folder cannot be written to, or a file in it must not be replaced.
         """
         target = check_outputs(folder, FILES, inputs, overwrite)
         names = FILES if find_spec("rasterio") else FILES[1:]
@@ -141,11 +141,11 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a north-up GeoTIFF: a band per layer and observable, and a band that is 1 where there is no path.
+    """Write a map as a north-up GeoTIFF: a band for each layer and observable, and a band that is 1 without a path.
 
     Args:
-        coverage: The map. If the map has no frame, the GeoTIFF has the coordinates of the scene and declares no
-            coordinate reference system.
+        coverage: The map. If the map has no frame, the GeoTIFF uses the scene's coordinates and declares no coordinate
+            reference system.
         path: The file.
 
     Raises:
@@ -163,7 +163,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
     rows, columns = coverage.z.shape
     layout = {"width": columns, "height": rows, "count": len(bands), "dtype": "float32", "nodata": np.nan}
     compressed = {"driver": "GTiff", "compress": "deflate", "predictor": 3}
-    # GDAL accepts only file names in UTF-8, so the file is created in memory.
+    # GDAL accepts only UTF-8 file names, so the file is first created in memory.
     with rasterio.MemoryFile() as memory:
         with memory.open(**compressed, **layout, **georeference) as file:
             for number, (name, values) in enumerate(bands.items(), start=1):

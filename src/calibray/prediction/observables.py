@@ -31,10 +31,10 @@ standard deviation estimated from 64 draws has a relative error of 9 %."""
 
 
 class Replayed(NamedTuple):
-    """An engine for new links, and the parameter values of the prediction model and then of every draw [1 + draws, d].
+    """An engine for new links, with parameter values [1 + draws, d]: those of the prediction model, then every draw.
 
-    If path loss is averaged over two sets of values, both sets precede the draws, and `averaged` is 2. `answers` is the
-    path loss that an external program returns for the values before the draws [averaged, links], [dB].
+    If path loss is averaged over two sets of values, both sets precede the draws, and `averaged` is 2. `answers`
+    [averaged, links], [dB], is the path loss that an external program returns for the values before the draws.
     """
 
     engine: Engine
@@ -55,11 +55,11 @@ def observable_columns(study: Study, level: float | None) -> tuple[str, ...]:
 def further_observables(
     result: Record, replayed: Replayed | None, level: float | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Predict further observables for the links of an opened study [links], without device biases, by column name.
+    """Predict further observables [links], by column name, for the links of an opened study, without device biases.
 
     The interval combines two parts: the errors of individual values, taken from held-out links if there are any, and
-        the scatter of the draws. The result is empty if the study has no further observables, or if the prediction
-        model uses no scene.
+    the scatter of the draws. The result is empty if the study has no further observables, or if the prediction model
+    uses no scene.
     """
     sections = result.study.observables
     if not sections or replayed is None or not isinstance(replayed.engine, Observing):
@@ -91,8 +91,8 @@ CHOICES: Final = (DELAY_SPREAD, EXCESS_DELAY, K_FACTOR, DEPARTURE_SPREAD, ARRIVA
 
 RELATIVE_ERROR: Final = 0.1
 """Expected error of a spread or an excess delay that the study does not measure, relative to the RMS of its values. In
-downtown Boulder, rotating the receiving array changes delay spreads by 3 % in line of sight and by 15 % out of
-sight."""
+downtown Boulder, rotating the receiving array changes delay spreads by 3 % on line-of-sight links and by 15 % on other
+links."""
 
 ERROR_DB: Final = 1.0
 """Expected error of a K-factor that the study does not measure [dB]."""
@@ -101,7 +101,7 @@ ERROR_DB: Final = 1.0
 class Worth(NamedTuple):
     """The most informative observable at a suggested link, assuming that the links ranked above it are also measured.
 
-    `narrowed` is the expected standard deviation of every parameter, relative to that with path loss alone [d].
+    `narrowed` [d] is the expected standard deviation of every parameter, relative to that with path loss alone.
     """
 
     kind: str
@@ -115,11 +115,11 @@ def worth_measuring(
     index: NDArray[np.int64],
     information: NDArray[np.float64],
 ) -> list[Worth]:
-    """Find the most informative observable at every suggested link [suggestions]; the best link comes first.
+    """Find the most informative observable [suggestions] at every suggested link; the best link comes first.
 
-    Draws of the parameters, and their derivatives with respect to the coordinates of the unit cube, have the shape [n,
-    d]. Each information matrix includes the path loss of a suggestion and of those ranked above it [suggestions, n, d,
-    d].
+    `draws` contains draws of the parameters and their derivatives with respect to the coordinates of the unit cube,
+    both of shape [n, d]. Each matrix in `information` [suggestions, n, d, d] includes the path loss of a suggestion and
+    of those ranked above it.
     """
     own = {section.kind: (name, section) for name, section in result.study.observables.items()}
     statistics = tuple(own[kind][1].statistic if kind in own else Statistic(kind) for kind in CHOICES)
@@ -165,7 +165,7 @@ def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[
     if reference is None:
         return {}
     unit = "db" if quantity == "path_gain" else "dbm"
-    # The upper end of path loss is the lower end of power.
+    # The upper end of the path-loss interval is the lower end of the power interval.
     ends = {"path_loss_db": "", "upper_db": "_lower", "lower_db": "_upper"}
     return {
         f"{quantity}{end}_{unit}": reference - table[name].to_numpy(float)
@@ -175,7 +175,7 @@ def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[
 
 
 def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] | None:
-    """The level from which path loss is subtracted [links], in [dBm] or [dB]; None if the level is unknown."""
+    """The level [links], [dBm] or [dB], from which path loss is subtracted; None if this level is unknown."""
     section = study.links
     if section.quantity == "path_loss":
         return None

@@ -1,4 +1,4 @@
-"""Path loss of new links with the calibrated scene and nuisances, and an interval for a measurement on each link."""
+"""Path loss of new links with the calibrated scene and nuisances, and an interval for a measurement of each link."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ from calibray.validation.models import without_scene
 _LOG: Final = logging.getLogger(__name__)
 
 NEIGHBOURS: Final = (0.125, 0.5)
-"""Displacements at which antennas are traced, as shares of the largest displacement; if this is 8 m, they are 1 m and 4
-m."""
+"""Displacements at which antennas are traced, as shares of the largest displacement. If the largest is 8 m, these
+displacements are 1 m and 4 m."""
 
 NEAR_SHARE: Final = 0.1
-"""A link counts as near measured links if these explain more than this share of the residual field's variance."""
+"""A link counts as near measured links if they explain more than this share of the residual field's variance."""
 
 WEAKER_DB: Final = 10.0
 """A prediction gets a remark if it exceeds the largest calibrated path loss by more than this value [dB]. In a
@@ -76,7 +76,7 @@ def predict(
 
     Raises:
         InputError: A column is missing, a position cannot be used, all receivers are far from the scene, a group has no
-            calibrated offset, or a file of the scene or an antenna has changed since the calibration.
+            calibrated offset, or a scene or antenna file has changed since the calibration.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     refuse_far_links(result, setup.links, read_triangles(setup.scene))
@@ -93,10 +93,10 @@ def predict_interval(
 ) -> pd.DataFrame:
     """Predict the path loss of new links, with an interval for a measurement; see `Result.predict_interval`.
 
-    The width of the interval has up to three parts. The first part is the size of the residuals of individual links,
-    taken from held-out links if the calibration has any. The second part is the scatter of the draws; if blocks were
-    held out, this part is omitted, because their residuals include it. The third part, for links of a group without
-    measurements, is the spread between groups.
+    The width of the interval has up to three parts. The first part is the typical size of the residuals of individual
+    links, taken from held-out links if the calibration has any. The second part is the scatter of the draws; if blocks
+    were held out, this part is omitted, because their residuals include it. The third part, for links of a group
+    without measurements, is the spread between groups.
 
     Raises:
         InputError: `predict` would reject the input for a reason other than unknown groups, the level is not between 0
@@ -138,7 +138,7 @@ def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -
 
 
 def _with_measured_spellings(model: PredictionModel, links: Measurements) -> Measurements:
-    """Spell labels as in the measurements; for example, a numeric column turns the label 007 into 7."""
+    """Restore the measurements' spelling of labels; for example, a numeric column turns the label 007 into 7."""
     for term in model.terms:
         spelling: dict[str, set[str]] = {}
         for label in term.coefficients:
@@ -174,8 +174,8 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
     """Open the study of a calibration for new links.
 
     Raises:
-        InputError: The scene or the parameters cannot be used, or a file of the scene or an antenna has changed since
-            the calibration.
+        InputError: The scene or the parameters cannot be used, or a scene or antenna file has changed since the
+            calibration.
     """
     warn_of_carriers(result, links)
     setup = Setup.open(result.study, links=links).placed_at(result.parameters, NEIGHBOURS)
@@ -184,7 +184,7 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
 
 
 def warn_of_carriers(result: Record, links: Measurements) -> None:
-    """Warn if links lack the study's column of carriers, or have carriers at which nothing was measured."""
+    """Warn if the links lack the study's column of carriers, or have carriers at which no link was measured."""
     column = result.study.links.frequency
     if column is not None and links.frequency is None:
         _LOG.warning(
@@ -221,9 +221,9 @@ def refuse_far_links(result: Record, links: Measurements, triangles: Triangles) 
 
 
 def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:
-    """The materials for the trace if the paths depend on the materials; otherwise None, because one trace suits all.
+    """The materials for the trace if the paths depend on them; otherwise None, because one trace serves all materials.
 
-    With refraction or diffuse reflection, and only then, the tracer's sampling depends on the materials. The powers of
+    The tracer's sampling depends on the materials only with refraction or diffuse reflection. The powers of
     rays from an external program always depend on the materials.
     """
     trace, rays = result.study.trace, result.study.engine.exports_rays
@@ -320,7 +320,7 @@ def interval(
 
 
 def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
-    """Quantile of Student's t for errors of links, and the ratio to it of the quantile for errors of blocks.
+    """Quantile of Student's t for errors of links, and the quantile for errors of blocks divided by that for links.
 
     The variances within and between blocks are estimates, each with its own degrees of freedom. Errors of blocks have
     as many degrees of freedom as there are blocks, because these errors are deviations from zero, not from an estimated
@@ -332,12 +332,12 @@ def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
 
 
 def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
-    """Standard deviation of the model's errors at new links [links], [dB]; `ratio` scales the part between blocks.
+    """Standard deviation of the model's errors on new links [links], [dB]; `ratio` scales the part between blocks.
 
     For links farther than `BlockErrors.reach_m` from all calibration links, the variance between blocks is raised by a
-    factor of up to two. A link this far away may differ from the blocks as much as the blocks differ from each other.
-    The contribution of random effects is subtracted, because `nuisance_shift` adds the spread of these effects for
-    links of a new group.
+    factor of up to two. The error of a link this far away may differ from those of the blocks as much as the blocks'
+    errors differ from each other. The contribution of random effects is subtracted, because for links of a new group,
+    `nuisance_shift` adds the spread of these effects.
     """
     model, ends = result.prediction.model, result.ends
     if model.blocks is None or ends is None:
@@ -375,7 +375,7 @@ def with_constants(result: Record, setup: Setup) -> Setup:
 def _replay(
     result: Record, setup: Setup, draws: dict[str, list[float]], progress: Progress | None
 ) -> Replayed | None:
-    """The engine for opened links, with the values of the prediction model and of all draws; None without a scene.
+    """The engine for opened links, with values of the prediction model and all draws; None if the model uses no scene.
 
     A program is called for the values of the prediction model (for both sets of values if the model is an average),
     because the program may differ from the replay in antennas and physics. The replay provides the change in path loss
@@ -419,7 +419,7 @@ def _replay(
 def _with_calibration_link(result: Record, setup: Setup) -> tuple[Setup, NDArray[np.float64]]:
     """Append one calibration link to the new links; return the opened study and this link's stored path loss [1], [dB].
 
-    The weakest link with a path is used, because the path loss of a weak link depends on most parts of a program. If
+    The weakest link with a path is used, because most parts of a program affect the path loss of a weak link. If
     the engine is not a program, or no link with a path has a carrier of the new links, the setup is unchanged, and the
     stored path loss is empty [0].
     """
@@ -471,7 +471,7 @@ def _answers(program: Engine, values: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _modelled(result: Record, links: Measurements, replayed: Replayed | None) -> NDArray[np.float64]:
-    """Path loss without nuisances, of the prediction model and then of every draw [1 + draws, links], [dB]."""
+    """Path loss [1 + draws, links], [dB], without nuisances, of the prediction model and then of every draw."""
     if replayed is None:
         return without_scene(result.study, links)[None]
     path_loss_db = _path_loss(replayed)
@@ -487,7 +487,7 @@ def _modelled(result: Record, links: Measurements, replayed: Replayed | None) ->
 
 
 def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
-    """Path loss for all values [n, links], [dB]; for a program, the sum of its answers and the changes from replay."""
+    """Path loss [n, links], [dB], for all values; for a program, its answers plus the changes computed by replay."""
     if (answers := replayed.answers) is None:
         return replayed.engine.path_loss(replayed.values)
     if len(replayed.values) == len(answers):
@@ -499,7 +499,7 @@ def _path_loss(replayed: Replayed) -> NDArray[np.float64]:
 
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Krige the residual field to links [links], [dB], and compute the known share of its variance [links]."""
+    """Krige the residual field [links], [dB], at new links, and compute the known share [links] of its variance."""
     field, ends = result.prediction.residual_field, result.ends
     if field is None or links.frequency is not None or ends is None:
         return np.zeros(len(links)), np.zeros(len(links))
@@ -508,7 +508,7 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
 
 
 def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
-    """Reject a scene or an antenna if one of its files has changed since the calibration.
+    """Reject the study if a scene or antenna file has changed since the calibration.
 
     Raises:
         InputError: A file has changed.
@@ -540,9 +540,9 @@ def add_remarks(result: Record, setup: Setup, predictions: pd.DataFrame) -> pd.D
 
 
 def _weak(result: Record, path_loss_db: NDArray[np.float64]) -> list[str]:
-    """The remark on links that are far weaker than all links used in the calibration [links].
+    """The remark [links] on each link that is far weaker than all links used in the calibration; otherwise empty.
 
-    The model was not fitted to links this weak. Measured links near the noise floor do not count, because the
+    The model was not fitted to links this weak. Measured links near the noise floor are ignored here, because the
     calibration does not use them.
     """
     measured_db = result.links["measured_db"].to_numpy(float)

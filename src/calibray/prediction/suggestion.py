@@ -57,7 +57,8 @@ MOST_DRAWS: Final = 96
 """Maximum number of posterior draws used to rank the candidates."""
 
 VALUES_PER_RANGE: Final = 24
-"""Number of values added in each separate range of a parameter, because some ranges contain few draws."""
+"""Number of values added to each separate range of a parameter; values are added because some ranges contain few
+draws."""
 
 LEAST_GAIN: Final = 0.02
 """Smallest relative narrowing of an interval, and smallest gain in probability, that the text reports."""
@@ -78,26 +79,26 @@ def suggest(
     a candidate, measuring it adds no information. If the predictions differ by more than the error of a link, a
     measurement rules out some of the draws. Candidates are chosen one at a time; each is the best addition to those
     already chosen. Candidates whose mean predicted power is too near the study's noise floor are left out, as in a
-    calibration. A warning in the log states the number of candidates left out and the required margin.
+    calibration. A warning in the log states how many candidates were left out, and the required margin.
 
     Args:
         result: The calibration, with the engine "replay" or "retrace" and with draws from the posterior.
         candidates: Possible measurements, given as links or as a table, as for `Result.predict`.
         count: Maximum number of suggestions; if there are fewer, a warning is logged.
         progress: Function that is called with the name of each stage, the completed work and the total.
-        allow_changed_inputs: If True, continue even if the links, or a file of the scene or an antenna, have changed
-            since the calibration.
+        allow_changed_inputs: If True, continue even if the links, or a scene or antenna file, have changed since the
+            calibration.
         observables: If True, also report which further observable is worth measuring at each suggestion.
 
     Returns:
         A table with one row per suggestion, the best suggestion first. The first columns are the candidate's row, its
         positions [m] and its group. The columns path_loss_db and spread_db are the mean and the standard deviation of
         the draws' predictions [dB]. For every parameter, NAME_width is the expected width of the 95 % interval after
-        this candidate and those above it are measured. For a parameter with several separate ranges, NAME_sure is the
+        measuring this candidate and those above it. For a parameter with several separate ranges, NAME_sure is the
         expected probability that the right range is known. The column gain summarizes these gains in words. With
-        `observables`, the column observable names the quantity that narrows the intervals most if measured, in addition
-        to path loss, at this candidate and those above it. The column observable_gain summarizes in words what the
-        observable gains.
+        `observables`, the column observable names the quantity that narrows the intervals most if it is measured in
+        addition to path loss at this candidate and those above it. The column observable_gain summarizes in words the
+        gain from this observable.
 
     Raises:
         InputError: `Result.predict` would reject the input for a reason other than unknown groups, the calibration has
@@ -251,9 +252,9 @@ class _ReplayedDraws:
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
         """Predict the path loss of the candidates and the errors of their measurements.
 
-        The first result is path loss for each draw and each further value [m, candidates], [dB]. The second contains
-        its derivatives with respect to the coordinates of the unit cube, at the draws [n, candidates, d], [dB]. The
-        third contains the expected errors of measurements.
+        The first result is the path loss [m, candidates], [dB], for each draw and each further value. The second
+        contains its derivatives [n, candidates, d], [dB], with respect to the coordinates of the unit cube, at the
+        draws. The third contains the expected errors of measurements.
         """
         objective, links = self.problem.objective, setup.links
         engine = self._engine(setup)
@@ -270,11 +271,11 @@ class _ReplayedDraws:
         return path_loss_db, (slope + design @ coefficient_slopes)[: self.num_draws], errors
 
     def floor_margin_db(self) -> float:
-        """Distance from the noise floor within which a calibration leaves out links, based on predicted path loss [dB].
+        """Margin [dB] above the noise floor within which a calibration leaves out links, judged by predicted path loss.
 
         The margin is that of `leave_out_near_floor` or, if smaller, the smallest distance of a calibration link from
-        the floor. The margin is 0 if there is no noise floor, or if links are censored, because the draws then use
-        links near the floor.
+        the floor. The margin is 0 if there is no noise floor. It is also 0 if links are censored, because the draws
+        then use links near the floor.
         """
         links, counted = self.problem.setup.links, self.problem.objective.weight > 0
         if links.limit_db is None or links.censored is not None:
@@ -305,17 +306,17 @@ class _ReplayedDraws:
         return replay(setup, setup.trace(materials, self.progress), compress_db)
 
     def _replay(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss for all draws and further values [m, links], and derivatives in the unit cube [m, links, d]."""
+        """Path loss [m, links] for all draws and further values, and its derivatives [m, links, d] in the unit cube."""
         loss, slope = engine.path_loss_and_jacobian(self.values)
         return loss, slope * (self.problem.parameters.search_slope(self.values) * self.width)[:, None, :]
 
     def _information(self, evaluation: Evaluation) -> NDArray[np.float64]:
-        """Fisher information from the links on the parameters in the unit cube, at every evaluated point [m, d, d]."""
+        """Fisher information [m, d, d] of the links about the parameters in the unit cube, at every evaluated point."""
         slopes = evaluation.slopes * self.width / self.noise_db
         return np.einsum("nmi,nmj->nij", slopes, slopes)
 
     def _further_values(self, draws: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Draw values around the draws of every separate range, with the scatter that the curvature implies [k, d]."""
+        """Draw values [k, d] around the draws of every separate range, with the scatter that the curvature implies."""
         parameters, piece = self.problem.parameters, self._pieces(draws)
         members = [
             np.flatnonzero(piece[:, k] == number)
@@ -334,7 +335,7 @@ class _ReplayedDraws:
         return parameters.from_search(np.clip(points + step, self.lower, self.lower + self.width))
 
     def _pieces(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Index of the separate range that contains each parameter's value or is nearest to it [m, d]."""
+        """Index [m, d] of the separate range that contains each parameter's value or is nearest to this value."""
         piece = np.zeros(values.shape, dtype=np.int64)
         for k, name in enumerate(self.problem.parameters.names):
             interval = self.result.intervals.get(name)
@@ -369,8 +370,8 @@ class _ReplayedDraws:
             labels = None if per is None or term.labels == ("",) else links.table.labels(per)
         coefficients = self.result.nuisance.coefficients.get(term.name, {})
         at_links = term.at(links, labels)
-        # A group without measurements gets the mean of the other groups; for a random effect, its deviation from the
-        # mean is 0.
+        # A group without measurements is assigned the mean of the other groups; for a random effect, its deviation from
+        # the mean is 0.
         others = 0.0 if term.around else 1.0 / len(term.labels)
         share = np.where(at_links.group[:, None] < 0, others, np.eye(len(term.labels))[at_links.group])
         new = np.flatnonzero(at_links.group < 0)
@@ -470,10 +471,10 @@ def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:
-    """Width of a parameter's interval if the draws narrow by a factor on the scale used for the search.
+    """Width of a parameter's interval if the scatter of the draws narrows by a factor on the scale used for the search.
 
     The draws apply only to the buildings on the links' paths. A measurement does not show how much other buildings
-    differ, so that part of the width remains.
+    differ, so the part of the width due to them remains.
     """
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)
@@ -483,7 +484,8 @@ def _width(result: Record, name: str, narrowed: float) -> float:
         (np.log(ends) if log else ends).mean(),
         *(np.ptp(np.log(bounds) if log else bounds) / 2 for bounds in (ends, seen)),
     )
-    # Squared widths add: one part is due to other buildings, and the measurement narrows the other part.
+    # The squares of the two parts of the width add: one part is due to other buildings, and the measurement narrows
+    # only the other.
     half = min(float(np.hypot(np.sqrt(max(half**2 - seen_half**2, 0.0)), narrowed * seen_half)), half)
     after = np.array([middle - half, middle + half])
     return float(np.ptp(np.exp(after) if log else after))

@@ -198,7 +198,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 @style.styled()
 def measured_over_modelled(result: Record) -> Figure | None:
-    """Draw measured versus modelled values of the first observables, without device biases; None without observables."""
+    """Draw measured versus modelled values of the first observables, without device biases; None if there are none."""
     fits = dict(list(result.fit.observables.items())[:PANELS])
     if not fits:
         return None

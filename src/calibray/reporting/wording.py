@@ -135,7 +135,7 @@ def scene_alone_text(record: Record) -> str:
 
 
 def _given_engine(record: Record) -> dict[str, Any] | None:
-    """The engine that a user passed to `calibrate`, as its remark describes it; None if the study's engine was called."""
+    """The engine that a user passed to `calibrate`, as named in its remark; None if the study's engine was called."""
     remarks = record.uncertainty.remarks
     return next((dict(remark.values) for remark in remarks if remark.kind is RemarkKind.GIVEN_ENGINE), None)
 

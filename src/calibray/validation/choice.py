@@ -33,7 +33,8 @@ from calibray.study.model import StudyModel
 from calibray.validation import models
 
 SEARCHES: Final = 16
-"""Number of local searches for the optimum of the model, in addition to the search from the calibrated optimum."""
+"""Number of local searches for the model's optimum, in addition to the search that starts from the calibrated
+optimum."""
 
 MOST_ERRORS: Final = 400
 """Maximum number of absolute errors stored with the model; if there are more errors, quantiles are stored instead."""
@@ -92,8 +93,8 @@ def fit_prediction_model(
         trail: The search that solved the problem.
         name: Name of the model; see `Model`.
         residuals: Residuals of the model on new links.
-        retrace_gap_db: Change in path loss of every link [L], [dB], from the paths of the search to paths traced with
-            the calibrated materials; None if the paths were not traced again.
+        retrace_gap_db: Change in path loss of every link [L], [dB], if the paths of the search are replaced by paths
+            traced with the calibrated materials; None if the paths were not traced again.
 
     Returns:
         The fitted model. Predictions and exports trace with the materials of this model, so its path loss includes this
@@ -149,7 +150,7 @@ def fit_prediction_model(
 
 @dataclass(frozen=True, eq=False)
 class FittedVariant:
-    """A variant fitted to the links with nonzero weight: parameters [d], objective, path loss without nuisance [L]."""
+    """A variant fitted to links with nonzero weight: parameters [d], objective, and path loss without nuisance [L]."""
 
     candidate: NDArray[np.float64]
     objective: Objective
@@ -189,7 +190,7 @@ def averaged_terms(
 ) -> tuple[FittedTerm, ...]:
     """The weighted mean of the terms of two models; the second model has all terms of the first.
 
-    The first model has the given weight. If the first model lacks a term, the coefficients and spread of the term are
+    `weight` is that of the first model. If the first model lacks a term, the coefficients and spread of the term are
     multiplied by the weight of the second model. If a group has a coefficient in only one model, this coefficient is
     used.
     """
@@ -208,10 +209,10 @@ def averaged_terms(
 
 
 def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[FittedTerm, ...]:
-    """The terms of the log-distance model with obstruction, in which the loss out of sight includes the prior mean.
+    """The terms of the log-distance model with obstruction, including the prior mean in the non-line-of-sight loss.
 
-    The fit treats the prior mean as known, even if no link out of sight has a nonzero weight. A nuisance that the study
-    declares for the same column does not have this prior.
+    The fit treats the prior mean as known, even if no non-line-of-sight link has a nonzero weight. A nuisance that the
+    study declares for the same column does not have this prior.
     """
     if any(term.by == OUT_OF_SIGHT for term in study.nuisance.values()):
         return terms
@@ -224,7 +225,7 @@ def with_prior_mean(terms: tuple[FittedTerm, ...], study: StudyModel) -> tuple[F
 
 
 def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
-    """Absolute errors, in the form that is stored with a model.
+    """Absolute errors in the form in which they are stored with a model.
 
     Args:
         absolute_errors: The errors, ascending [n], [dB].
@@ -251,12 +252,13 @@ def fitted_terms(
         The terms. Groups without fitted links are left out.
     """
     coefficients = objective.completed(path_loss_db[None])[0]
-    # The fit still gives a coefficient to a group whose links do not determine it.
+    # The fit returns a coefficient even for a group whose links do not determine it.
     has_links = np.asarray(abs(objective.nuisance.design[objective.weight > 0]).sum(axis=0)).ravel() > 0
     used = objective.determined | has_links & (coefficients != 0)
     by_term, terms = objective.nuisance.by_term(coefficients, used), []
     spreads = {term.around: term.prior for term in objective.nuisance.terms if term.around}
-    # A random effect is a single term with the groups of the deviations.
+    # A random effect, which has one term for its mean and one for the deviations, becomes a single term with the groups
+    # of the deviations.
     grouped = {term.around or term.name: term for term in objective.nuisance.terms}
     for name, term in grouped.items():
         if term.labels == ("",):

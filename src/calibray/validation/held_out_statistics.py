@@ -1,8 +1,8 @@
 """Statistics of held-out errors: spatial blocks, comparison of two models, and widths of prediction intervals.
 
-The interval is conformal: among n + 1 exchangeable errors, a new error has every rank with the same probability. The
-absolute value of a new error is therefore at most the ((n + 1) p)-th smallest of the n observed absolute errors with
-probability p, regardless of their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random
+The interval is conformal: among n + 1 exchangeable errors, a new error has every rank with the same probability. With
+probability p, the absolute value of a new error is therefore at most the ((n + 1) p)-th smallest of the n observed
+absolute errors, regardless of their distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random
 World, 2005; R. J. Barber et al., Ann. Statist. 49, 2021, for held-out links). Link errors have heavier tails than a
 Gaussian distribution, so an interval computed from their RMS value would be too wide at 90 %. If there are few errors,
 their largest values are too uncertain, and Student's t distribution is used instead.
@@ -37,7 +37,7 @@ from calibray.result.held_out import (
 from calibray.study.model import StudyModel
 
 Errors = Mapping[Any, NDArray[np.float64]]
-"""Residuals [n], [dB], by model; a key is a `Model` or its name."""
+"""Residuals [n], [dB], by model; each key is a `Model` or its name."""
 
 CLUSTER_LINKS: Final = 4
 """Number of neighbouring links that are resampled together, because neighbours share part of their noise."""
@@ -48,7 +48,7 @@ MOST_CLUSTERS: Final = 1000
 RESAMPLES: Final = 2000
 
 LEAST_GAIN: Final = 0.05
-"""Minimum relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases came from a
+"""Minimum relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases were due to a
 single block, and the fitted model was up to 3 dB worse on separately held-out clusters. With simulated misfits, every
 decrease was larger."""
 
@@ -56,15 +56,15 @@ REACHED: Final = 0.9
 """Fraction of the held-out links that are at most `BlockErrors.reach_m` from a link outside their own block."""
 
 AVERAGE_LINKS: Final = 8
-"""Weight, as a number of links, of the mean square error of all links in the estimate for links out of sight. A few
-links out of sight give little information about their own errors."""
+"""Weight, expressed as a number of links, that the mean square error of all links has in the estimate for
+non-line-of-sight links. A few such links give little information about their own errors."""
 
 FEWEST_FOR_RANKS: Final = 40
 """Minimum number of errors whose ranks determine an interval; for fewer errors, Student's t distribution is assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide positions [n, 2 or 3], [m], into compact blocks of about equal size, numbered from 0 [n].
+    """Divide positions [n, 2 or 3], [m], into compact blocks [n] of about equal size, numbered from 0.
 
     The largest block is halved across its longer side until there are `count` blocks, or n if `count` is larger.
 
@@ -89,14 +89,14 @@ def moving_end(links: Measurements) -> NDArray[np.float64]:
 
 
 def place_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but keep each position in one block [n].
+    """Divide links by horizontal position [n, 3], [m], like `spatial_blocks`, but never split a position; blocks [n].
 
     Example:
         >>> place_blocks(np.array([[0.0, 0, 1], [0.0, 0, 4], [0.0, 0, 7], [9.0, 0, 1]]), 2).tolist()
         [0, 0, 0, 1]
     """
     _, first, place = np.unique(position[:, :2], axis=0, return_index=True, return_inverse=True)
-    # Distinct positions keep the order of the links, because this order decides between equal coordinates.
+    # Distinct positions keep the order of the links, because this order breaks ties between equal coordinates.
     order = np.argsort(first)
     block = np.empty(len(first), dtype=np.int64)
     block[order] = spatial_blocks(position[first[order], :2], count)
@@ -107,7 +107,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
     """Compare a model with its best baseline, by residuals on the same held-out links [n], [dB].
 
     The standard error of the difference is estimated by resampling clusters of links with neighbouring positions [n,
-    3], [m]. The same clusters are used for both models. Links with a non-finite residual are left out.
+    3], [m]. The same clusters are used for both models. Links with a residual that is not finite are left out.
     """
     table = np.stack([errors, *baselines.values()])
     finite = np.isfinite(table).all(axis=0)
@@ -174,12 +174,12 @@ def two_levels(
     position: NDArray[np.float64],
     fitted: NDArray[np.float64] | None = None,
 ) -> BlockErrors | None:
-    """Variance of held-out errors [n], [dB], within and between blocks (analysis of variance of random effects).
+    """Variance of held-out errors [n], [dB], within and between blocks (random-effects analysis of variance).
 
     Each new street has its own error, so a few blocks contain less information than the number of links suggests.
-    `position` [n, k], [m], contains the positions of both ends of each link. `fitted` [m, k] contains the positions of
-    the links to which the models were fitted; if None, the models were fitted to the links of the other blocks. The
-    result is None if there are fewer than two blocks, or no more links than blocks.
+    `position` [n, k] contains the positions of both ends of each link, in metres. `fitted` [m, k] contains those of the
+    links to which the models were fitted; if None, the models were fitted to the links of the other blocks. The result
+    is None if there are fewer than two blocks, or no more links than blocks.
 
     Example:
         >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
@@ -190,10 +190,10 @@ def two_levels(
     count, links = len(size), len(errors)
     if count < 2 or links <= count:
         return None
-    # The mean over the links of a block has the variance within / size around the common error of the block.
+    # Around the common error of a block, the mean over its links has the variance `within / size`.
     mean = np.bincount(index, errors) / size
     within = float(np.sum((errors - mean[index]) ** 2)) / (links - count)
-    # Predictions do not correct the mean error of a block, so its deviation is measured from zero.
+    # Predictions are not corrected for the mean error of a block, so its deviation is measured from zero.
     between = max(float(np.mean(mean**2 - within / size)), 0.0) * (1.0 + 1.0 / count)
     distance = np.empty(links)
     for number in range(count):
@@ -204,10 +204,10 @@ def two_levels(
 
 
 def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) -> float:
-    """RMS error of links out of sight, divided by the RMS error of all links, from residuals [n], [dB].
+    """RMS error of non-line-of-sight links, divided by the RMS error of all links, from residuals [n], [dB].
 
-    The ratio is at least 1, so links in sight keep the interval of all links. If few links are out of sight, the ratio
-    is shrunk towards 1 (`AVERAGE_LINKS`).
+    The ratio is at least 1; line-of-sight links keep the interval of all links. If few links have no line of sight, the
+    ratio is shrunk towards 1 (`AVERAGE_LINKS`).
 
     Example:
         >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
@@ -222,7 +222,7 @@ def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:
     """Half-width [dB] of the interval that contains a new error with probability `level`.
 
-    Absolute errors are in ascending order [n], [dB].
+    Absolute errors [n], [dB], are in ascending order.
 
     Example:
         >>> errors = np.sort(np.abs(np.random.default_rng(0).standard_normal(999)))
@@ -234,7 +234,7 @@ def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> f
     student_t = float(stdtrit(count, (1 + level) / 2)) * rms
     if count < FEWEST_FOR_RANKS:
         return student_t
-    # There are too few observed errors for an upper limit at this level.
+    # There are too few observed errors for their ranks to give an upper limit at this level.
     if rank > count:
         return max(student_t, float(absolute_errors[-1]))
     return float(np.interp(rank, np.arange(1, count + 1), absolute_errors))
@@ -247,7 +247,7 @@ MODELS: Final = ("calibrated", "mean", "law of distance")
 def held_out_gaps(
     problem: Problem, best: NDArray[np.float64], held_out: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.float64]]:
-    """Predicted minus measured values of every observable on held-out links, for the three `MODELS` [3, L].
+    """Predicted minus measured values [3, L] of every observable on held-out links, for the three `MODELS`.
 
     Each value has the unit of the observable. Biases are fitted to the other links. The optimum `best` [d] is in the
     parameters' units. The values of links that are not judged are NaN.
@@ -270,7 +270,10 @@ def held_out_gaps(
 def observable_errors(
     gaps: Mapping[str, NDArray[np.float64]], study: StudyModel
 ) -> dict[str, ObservableErrors]:
-    """RMS errors of the models by observable, from gaps [3, L]. Observables without a judged link are omitted."""
+    """RMS errors of the models by observable, from predicted minus measured values [3, L].
+
+    Observables without a judged link are omitted.
+    """
     errors = {}
     for name, gap in gaps.items():
         judged = gap[:, np.isfinite(gap).all(axis=0)]
@@ -290,10 +293,13 @@ def _law(observable: Observed, links: Measurements) -> NDArray[np.float64]:
 def _with_biases(
     observable: Observed, feature: NDArray[np.float64], weight: NDArray[np.float64], *, slope: bool
 ) -> NDArray[np.float64]:
-    """The feature, or a fitted multiple of it, plus fitted biases. Groups without used links get the mean bias."""
+    """The feature, or a fitted multiple of it, plus fitted biases.
+
+    Groups without links in the fit are assigned the mean bias.
+    """
     used = observable.used(weight)
     used = used[np.isfinite(feature[used])]
-    # The model has a bias only if the study states a bias; the mean and the law always have a constant.
+    # The model has a bias only if the study states a bias; the mean and the law always include a constant.
     constant = slope or not np.any(feature)
     if observable.labels:
         groups = np.unique(observable.group[used])

@@ -4,10 +4,11 @@ The baselines are the log-distance model, the log-distance model with terms for 
 kriging.
 
 The variants are the study's own model, the initial materials, the model with a prior around the initial values, and the
-model with this prior and with offsets per transmitter and for links out of sight. An engineer would try these models by
-hand. The best variant differs between campaigns, so the choice is based on held-out links (`validate.py`). Both offsets
-have a prior around zero, which keeps the offsets small unless the links require them. A single variant with both
-offsets is therefore sufficient. Further variants make the choice worse (docs/measurements/predictions.md).
+model with both this prior and offsets, per transmitter and for non-line-of-sight links. These are the models that an
+engineer would try by hand. The best variant differs between campaigns, so the choice is based on held-out links
+(`validate.py`). Both offsets have a prior around zero, which keeps the offsets small unless the measurements require
+larger ones. A single variant with both offsets is therefore sufficient. Further variants make the choice worse
+(docs/measurements/predictions.md).
 """
 
 from __future__ import annotations
@@ -47,8 +48,9 @@ from calibray.study.mounting import direct_gain
 from calibray.uncertainty.residual_correlation import fit_correlation
 
 OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
-"""Mean and standard deviation [dB] of the prior of the loss out of sight. 3GPP TR 38.901 (UMi) gives 10 dB at 20 m and
-20 dB at 100 m. If all fitted links are in sight, only the prior gives information about this loss."""
+"""Mean and standard deviation [dB] of the prior for the additional loss of non-line-of-sight links. 3GPP TR 38.901
+(UMi) gives 10 dB at 20 m and 20 dB at 100 m. If all fitted links have line of sight, only the prior gives information
+about this loss."""
 
 WALL_DB: Final = 2.0
 """Standard deviation of the zero-mean prior for the loss per wall crossed [dB]. Indoors, walls dominate path loss,
@@ -56,21 +58,22 @@ whatever the prior. Outdoors, waves travel around buildings. With a standard dev
 held-out cluster in Boulder was 17 dB."""
 
 ROUNDS: Final = 4
-"""Number of rounds, each of which fits the errors and then the losses with their priors. Further rounds change results
-by 0.01 dB."""
+"""Number of rounds; each round first estimates the RMS error, and then fits the losses with their priors. Further
+rounds change results by 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
-"""Lower limit [dB] of the error of the log-distance model; this error sets the weight of the priors."""
+"""Lower limit [dB] on the RMS error of the log-distance model; this error determines the weight of the priors."""
 
 MOST_KRIGED: Final = 1000
-"""Maximum number of links for kriging. The fit of the correlation factorizes their covariance a few hundred times."""
+"""Maximum number of links from which residuals are kriged. Fitting the correlation factorizes the covariance of these
+links a few hundred times."""
 
 
 def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
     """The part of path loss [links], [dB], that requires no scene: the increase with frequency, minus antenna gains.
 
     Path loss increases by 20 log10(f / f0) from the study's carrier f0, as in free space. The gains are those of the
-    stated antennas along the straight line; columns of the links state their directions.
+    stated antennas along the straight line between them; columns of the links state the directions in which they point.
 
     Raises:
         InputError: A column of the antennas is missing or malformed.
@@ -81,7 +84,9 @@ def without_scene(study: StudyModel, links: Measurements) -> NDArray[np.float64]
 
 
 class Baseline(NamedTuple):
-    """A model without paths. All unknowns are nuisance coefficients, which the links with nonzero weight determine.
+    """A model without paths.
+
+    All unknowns are nuisance coefficients, which are determined by the links with nonzero weight.
 
     Attributes:
         objective: The model as an objective.
@@ -92,7 +97,10 @@ class Baseline(NamedTuple):
     known_db: NDArray[np.float64]
 
     def path_loss_db(self) -> NDArray[np.float64]:
-        """Path loss on all links [links], [dB]. Groups without links of nonzero weight get the mean of other groups."""
+        """Path loss on all links [links], [dB].
+
+        Groups without links of nonzero weight are assigned the mean of other groups.
+        """
         return self.objective.with_nuisance(self.known_db)
 
 
@@ -125,15 +133,15 @@ def log_distance(links: Measurements, objective: Objective, known_db: NDArray[np
 
 
 def has_obstruction(links: Measurements) -> bool:
-    """Whether the links have the columns computed from a scene and the direct line of at least one link is blocked."""
+    """Whether the links have the columns computed from a scene and at least one line of sight is blocked."""
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
 def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.float64]) -> Baseline:
-    """The log-distance model with a loss out of sight and a loss per wall, using the columns computed from the scene.
+    """The log-distance model with non-line-of-sight loss and a loss per wall, from columns computed with the scene.
 
-    The loss out of sight has a prior with a nonzero mean. The mean is part of the known path loss, and the deviation
-    from this mean is a coefficient. The arguments are those of `log_distance`.
+    The non-line-of-sight loss has a prior with a nonzero mean. The mean is part of the known path loss, and the
+    deviation from this mean is a coefficient. The arguments are those of `log_distance`.
 
     Raises:
         EngineError: Fewer than two links have a nonzero weight.
@@ -147,14 +155,14 @@ def obstructed(links: Measurements, objective: Objective, known_db: NDArray[np.f
         known_db = known_db + OUT_OF_SIGHT_DB[0] * links.table.numbers(OUT_OF_SIGHT)
     nuisance = Nuisance(len(links), tuple(terms))
     model = replace(model, nuisance=nuisance)
-    # The errors set the weight of the priors, and the priors change the errors, so both are iterated.
+    # The RMS error determines the weight of the priors, and the priors change the RMS error, so the fit is repeated.
     for _ in range(ROUNDS):
         model = replace(model, noise_db=max(float(model.rmse(known_db[None])[0]), LEAST_NOISE_DB))
     return Baseline(model, known_db)
 
 
 def _free_name(by: str, terms: Sequence[Term]) -> str:
-    """A name, unused by other terms, for a term of the column `by`."""
+    """A name that no other term uses, for a term of the column `by`."""
     names = {term.name for term in terms}
     plain = by.replace("_", " ") if by in (OUT_OF_SIGHT, WALLS) else by
     return next(name for name in (plain, f"{plain} of all", f"{plain} of all links") if name not in names)
@@ -163,7 +171,7 @@ def _free_name(by: str, terms: Sequence[Term]) -> str:
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:
     """Path loss of a model on all links [links], [dB], plus residuals kriged from the links with nonzero weight.
 
-    The model was fitted to these links. Its path loss is `trend_db` [links], [dB].
+    The model was fitted to the links with nonzero weight. Its path loss is `trend_db` [links], [dB].
 
     Raises:
         InputError: There are too few links or more than `MOST_KRIGED` links, or all links have the same position.
@@ -175,7 +183,7 @@ def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.floa
         raise InputError(f"kriging: too many links ({count}), must be at most {MOST_KRIGED}")
     position = np.hstack([links.rx, links.tx])
     measured, residual = position[counted], (objective.measured - trend_db)[counted]
-    # The fit removed an intercept and, unless all distances are equal within rounding, a slope.
+    # The fit removed an intercept and, unless all distances are equal to within rounding, a slope.
     decades = np.log10(links.distance[counted])
     decades -= decades.mean()
     design = np.ones((count, 1))
@@ -202,7 +210,7 @@ def kriged(
 
 
 def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.float64]]:
-    """Path loss of each baseline without paths on all links [links], [dB], fitted to the links with nonzero weight."""
+    """Path loss [links], [dB], of each baseline without paths on all links; links with nonzero weight were fitted."""
     links, known_db = setup.links, without_scene(setup.study, setup.links)
     path_loss_db = {Model.LOG_DISTANCE: log_distance(links, objective, known_db).path_loss_db()}
     if has_obstruction(links):
@@ -211,11 +219,12 @@ def without_paths(setup: Setup, objective: Objective) -> dict[Model, NDArray[np.
 
 
 PRIOR_SPREAD: Final = 0.3
-"""Standard deviation of the logarithm of a parameter around the initial value, in the variants with a prior."""
+"""Standard deviation of the prior for the logarithm of a parameter around its initial value, in variants with a
+prior."""
 
 OFFSET_PRIOR_DB: Final = 10.0
-"""Standard deviation [dB] of the zero-mean priors of two offsets: the offset of a transmitter relative to the offset of
-all links, and the offset of links out of sight. In downtown Boulder, the latter offset is 11.7 dB."""
+"""Standard deviation [dB] of the zero-mean priors of two offsets: the offset of a transmitter relative to that of all
+links, and the offset of non-line-of-sight links. In downtown Boulder, the latter offset is 11.7 dB."""
 
 MOST_STARTS: Final = 4
 """Maximum number of known minima from which searches start."""
@@ -240,11 +249,11 @@ def fit_variants(
 
     Args:
         part: The problem; held-out links have weight 0.
-        known_minima: Minima of fits to more links, by variant [k, d], as starting points. If the minima of the study's
-            own model are missing, the full ranges of the parameters are searched.
+        known_minima: Minima [k, d] of fits to more links, by variant, used as starting points. If the minima of the
+            study's own model are missing, the full ranges of the parameters are searched.
 
     Returns:
-        Problem and minima [k, d] of each variant by name; the best minimum comes first.
+        The problem and the minima [k, d] of each variant, by name; the best minimum comes first.
     """
     if Model.CALIBRATED in known_minima:
         calibrated = find_minima(part, known_minima[Model.CALIBRATED], _new_starts(part))
@@ -269,7 +278,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
 
     Args:
         part: The problem; held-out links have weight 0.
-        best: The optimum of the problem [d]; its residuals determine the noise that scales the priors.
+        best: The optimum of the problem [d]; the residuals there determine the noise level that scales the priors.
 
     Returns:
         The problems by name. For `Model.INITIAL`, only the nuisance is fitted.
@@ -302,7 +311,7 @@ def find_minima(problem: Problem, starts: NDArray[np.float64], new_starts: int) 
 
 
 def averages(path_loss_db: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """Path loss [links], [dB], of every average for which both models are given, by name."""
+    """Path loss [links], [dB], by name, of every average of two models that are both given."""
     return {
         name: average.of(path_loss_db[average.first], path_loss_db[average.second])
         for name, average in AVERAGES.items()
@@ -320,8 +329,8 @@ def _new_starts(problem: Problem) -> int:
     """Number of additional starting points if minima of the same variant, fitted to more links, are known.
 
     A large path program gets fewer points, because its calibration also makes fewer searches. With one point instead of
-    four, errors on held-out links in Auckland agree within 0.001 dB. For small path programs, more points often lead to
-    a lower minimum.
+    four, errors on held-out links in Auckland agree to within 0.001 dB. For small path programs, more points often lead
+    to a lower minimum.
     """
     return min(max(_searches(problem) // STARTS[0], 1), NEW_STARTS)
 
@@ -332,7 +341,7 @@ def initial_objective(objective: Objective, setup: Setup) -> Objective:
 
 
 def with_offsets(objective: Objective, links: Measurements) -> Objective | None:
-    """The objective with offsets per transmitter and for links out of sight, both with a prior; None if impossible.
+    """The objective with offsets per transmitter and for non-line-of-sight links, both with priors; None if impossible.
 
     There are no offsets per transmitter if there is only one transmitter, or if another term already has groups.
     """
@@ -358,7 +367,7 @@ def _with_term(
 
 
 def _priors_around_start(problem: Problem) -> LogNormal:
-    """The priors of the study, and a prior around the initial value of every other positive parameter."""
+    """The priors of the study, and a prior around the initial value for every positive parameter without a prior."""
     parameters, priors = problem.parameters, problem.priors
     added = [
         index

@@ -1,4 +1,4 @@
-"""Refits several models without each block of links in turn, and compares the models on the held-out block."""
+"""Refit several models without each block of links in turn, and compare the models on the held-out block."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def validate(
             applies, or 4 if the study does not state a number.
         by: Column of labels; all links with the same label are held out together. "tx" stands for the position of the
             transmitter.
-        workers: Workers that trace and replay chunks of links (`engines.open_workers`). If None, this process does
-            both.
+        workers: Workers that trace and replay chunks of links (`engines.open_workers`). If None, this process does all
+            of this work.
         progress: Called with the name of the stage, the completed work and the total work.
         tracer: Function that opens the scene in a ray tracer; ignored if the study is already open.
         ledger: SQLite file that stores RT calls for a program that returns rays, such as `ledger.sqlite` in the folder
@@ -88,7 +88,7 @@ def validate(
             f"validate: blocks = {blocks!r}; must be a whole number from 2 to {MOST_BLOCKS}, because each block "
             "requires a calibration"
         )
-    # Links that the study holds out are held out in turn like all other links.
+    # Links that the study holds out are treated like all others: they are held out in turn.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
     engine = engines.make(setup, None, progress, ledger, workers)
@@ -101,7 +101,7 @@ def validate(
 
 
 def check_engine(study: StudyModel) -> None:
-    """Raise an error if a dozen calibrations with this engine would be too expensive.
+    """Raise an error if the dozen or so calibrations would be too expensive with this engine.
 
     Raises:
         InputError: The engine is not "replay".
@@ -152,7 +152,7 @@ def validate_problem(
         if progress is not None:
             progress("validating", number + 1, len(labels))
     judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
-    # A model that is missing in a block, such as kriging, is not compared.
+    # A model that is missing for one of the blocks, such as kriging, is not compared.
     complete = {name: residual for name, residual in errors.items() if np.isfinite(residual[judged]).all()}
     return Validation(
         labels, np.where(judged, block, -1), complete, moving_end(links), objective.measured,
@@ -161,7 +161,7 @@ def validate_problem(
 
 
 def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
-    """Warn of offsets that are unknown for held-out links because all links of a group are in one block [n]."""
+    """Warn of offsets that are unknown for held-out links because a group's links are all in the same block [n]."""
     counted = np.flatnonzero(block >= 0)
     stated = problem.setup.study.nuisance_terms
     for term in problem.objective.nuisance.terms:
@@ -179,7 +179,7 @@ def _announce_new_groups(problem: Problem, block: NDArray[np.int64]) -> None:
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Block of every link (-1 for links of weight 0), and the labels of the blocks."""
+    """The block of every link (-1 for links of weight 0), and the labels of the blocks."""
     links, holdout = problem.setup.links, problem.setup.study.holdout
     if count is None and by is None and holdout is not None:
         count, by = holdout.blocks, holdout.by
@@ -210,7 +210,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 def fit_models(
     part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Path loss on all links by model [links], [dB]. The models are fitted to the links with nonzero weight.
+    """Path loss [links], [dB], on all links, by model. The models are fitted to the links with nonzero weight.
 
     Kriging is omitted if it is impossible. `fits` contains the fitted variants that use the scene (see `fit_variants`).
     """

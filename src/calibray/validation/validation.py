@@ -3,10 +3,10 @@
 Predictions use the initial materials with fitted offsets unless another model is better by more than both the bootstrap
 error of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984) and
 5 % of the RMSE. The best calibrated model is tried first, then the log-distance model, which uses no scene. A few
-blocks hardly distinguish models of similar accuracy, and a fitted model has larger errors elsewhere if its fit is
-specific to these blocks. The calibrated model without a prior must therefore be significantly better than the model
-with a prior. The chosen model is averaged with a second model, because the best model on a few blocks is often not the
-best elsewhere.
+blocks hardly distinguish between models of similar accuracy, and a model that was overfitted to these blocks has larger
+errors elsewhere. The calibrated model without a prior must therefore be significantly better than the model with a
+prior. The chosen model is averaged with a second model, because the best model on a few blocks is often not the best
+elsewhere.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
 class Validation(HeldOutErrors):
     """Held-out errors of several models on the same links, and the conclusions from these errors.
 
-    The error expected in a block is estimated from the other blocks only.
+    The error expected in a block is estimated only from the other blocks.
     """
 
     @classmethod
     def of(cls, errors: HeldOutErrors) -> Validation:
-        """The validation that belongs to held-out errors."""
+        """The validation with the given held-out errors."""
         if isinstance(errors, Validation):
             return errors
         return cls(
@@ -103,7 +103,7 @@ class Validation(HeldOutErrors):
 
     @cached_property
     def chosen(self) -> str:
-        """The prediction model; never kriging or the residual field, because these help only near measured links."""
+        """The prediction model; never kriging or the residual field, because these only help near measured links."""
         return predicting(self._on(self.judged), self.position[self.judged])
 
     @cached_property
@@ -128,7 +128,7 @@ class Validation(HeldOutErrors):
 
     @property
     def sentence(self) -> str:
-        """A sentence on the improvement of the calibration over the best baseline, and the certainty of this gain."""
+        """A sentence that states by how much calibration improves on the best baseline, and how certain this is."""
         return judgement_text(self.judgement)
 
     @property
@@ -143,7 +143,7 @@ class Validation(HeldOutErrors):
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
 
     def levels(self, name: str, links: Measurements) -> BlockErrors | None:
-        """Standard deviations of a model's held-out residuals within and between blocks; None if there are too few."""
+        """Standard deviations of a model's held-out residuals within and between blocks; None if too few links."""
         position = np.hstack([links.tx, links.rx])[self.judged]
         return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
@@ -197,7 +197,7 @@ class Validation(HeldOutErrors):
     def _figures(self, name: str) -> dict[str, float]:
         errors, log_density, inside = self.errors[name], [], []
         for block in self._blocks():
-            # The error expected in this block follows from the other blocks.
+            # The error expected in this block is estimated from the other blocks.
             others = errors[self.judged & ~block]
             rms = float(np.sqrt(np.mean(others**2)))
             log_density.append(-0.5 * (errors[block] / rms) ** 2 - np.log(rms * np.sqrt(2 * np.pi)))
