@@ -1,9 +1,9 @@
 """Geographic coordinates of a scene.
 
-A scene has a local coordinate frame: from an origin, x points east and y points north. Map projections distort lengths
-(UTM by up to 1 m per kilometre). The default frame is therefore PROJ's azimuthal equidistant projection (`aeqd`),
-centred on the scene. In this projection, lengths are accurate to 1 mm per kilometre within several kilometres of the
-centre.
+A scene has a local coordinate frame, in which x points east and y points north from an origin. Map projections distort
+lengths; UTM, for example, does so by up to 1 m per kilometre. The default frame is therefore PROJ's azimuthal
+equidistant projection (`aeqd`), centred on the scene. In this projection, lengths are accurate to 1 mm per kilometre
+within several kilometres of the centre.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
 WGS84: Final = "EPSG:4326"
-"""Coordinate reference system of GPS receivers: longitude and latitude."""
+"""Coordinate reference system that GPS receivers use: longitude and latitude."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Frame:
         height: Height of the plane z = 0 above the vertical datum of the geographic heights [m].
 
     Raises:
-        InputError: PROJ does not know the projection, the projection is not in metres with x pointing east and y
+        InputError: PROJ does not know the projection, its coordinates are not in metres with x pointing east and y
             pointing north, or the origin is not finite.
     """
 
@@ -87,7 +87,8 @@ class Frame:
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
             raise InputError(f"latitude = {latitude:g}: must be -80 to 84 degrees for UTM; use a local frame")
-        # A longitude of 180 degrees east would give zone 61. The regular zones also suffice in Norway and Svalbard.
+        # A longitude of 180 degrees east would give zone 61. The regular zones are also adequate in Norway and
+        # Svalbard.
         zone = min(int((longitude + 180) // 6) + 1, 60)
         crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         easting, northing, _ = cls(crs).to_scene([longitude], [latitude])[0]
@@ -128,9 +129,10 @@ class Frame:
         Args:
             longitude: Longitude, positive east of Greenwich [n], [deg]; or x in the units of `crs`.
             latitude: Latitude, positive north of the equator [n], [deg]; or y in the units of `crs`.
-            height: Height above the vertical datum of the frame [m]: one per position [n], or one for all positions.
+            height: Height above the vertical datum of the frame [m]: one value per position [n], or one for all
+                positions.
             crs: Coordinate reference system of the positions.
-            rows: Row number of each position in its table [n], for error messages; if None, messages state the
+            rows: Row number of each position [n] in its table, for error messages; if None, messages state the
                 position's index.
 
         Returns:
@@ -154,7 +156,7 @@ class Frame:
         return np.stack([easting - self.easting, northing - self.northing, z - self.height], axis=-1)
 
     def to_geographic(self, positions: ArrayLike) -> NDArray[np.float64]:
-        """Convert positions x, y, z [n, 3], [m], to longitude [deg], latitude [deg] and height [m] [n, 3]."""
+        """Convert positions x, y, z [n, 3], [m], to longitude and latitude [deg] and height [m], as an array [n, 3]."""
         x, y, z = np.moveaxis(np.asarray(positions, dtype=float), -1, 0)
         longitude, latitude = transformer(self.crs, WGS84).transform(x + self.easting, y + self.northing)
         return np.stack([longitude, latitude, z + self.height], axis=-1)
@@ -178,7 +180,7 @@ def parse_crs(crs: object) -> CRS:
 
 @lru_cache
 def transformer(source: object, target: object) -> Transformer:
-    """The transformation between two coordinate reference systems; x (longitude) is always the first coordinate.
+    """The transformation between two coordinate reference systems; x or longitude is always the first coordinate.
 
     Creating a transformation takes up to 0.3 s, so each transformation is created only once per process.
 
@@ -217,7 +219,8 @@ def find_projection(
     here = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
     known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
     utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
-    # At least half of the positions must lie on the scene; if candidates have equal shares, the first is used.
+    # At least half of the positions must lie on the scene; if several candidates have the same share, the first is
+    # used.
     best, most = None, 0.5
     # The same coordinates in two geodetic datums denote points less than 3 km apart, and usually less than 1 km.
     reach = 3000.0 + 2 * float(np.max(np.subtract(high, low)))

@@ -1,4 +1,4 @@
-"""Checks whether tracing and replay work on this machine, and suggests remedies if they do not.
+"""Check whether tracing and replay work on this machine, and suggest remedies if they do not.
 
 Version numbers alone do not show whether a library works, so Dr.Jit, Sionna RT and JAX each run a small test. The tests
 run in subprocesses, because a libLLVM that Dr.Jit cannot use kills the process.
@@ -20,7 +20,7 @@ from calibray.tracing import llvm
 from calibray.tracing.llvm import Llvm
 
 CHECK_TIMEOUT = 300.0
-"""Time limit of one check [s]; from a slow disk, the first import alone can take most of this time."""
+"""Time limit of one check [s]; if the disk is slow, the first import alone can take most of this time."""
 
 # Package name and, if present, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
 _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
@@ -63,7 +63,7 @@ print(", ".join(f"{device.platform}:{device.id}" for device in jax.devices()))
 
 @dataclass(frozen=True)
 class Check:
-    """The check of one library that Calibray requires.
+    """The outcome of checking one library that Calibray requires.
 
     Attributes:
         name: The library.
@@ -139,7 +139,7 @@ def examine() -> Diagnosis:
 def check_tracing(variant: str) -> tuple[Check, ...]:
     """Check the libraries that a Mitsuba variant needs for tracing: Dr.Jit, Sionna RT and, on the CPU, libLLVM.
 
-    The returned checks end with the first failure, because the later checks depend on the earlier ones.
+    The checks stop at the first failure, because the later checks depend on the earlier ones.
     """
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
@@ -172,7 +172,7 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
         return Check(name, True, run.stdout.strip() or "works", remedy)
     lines = run.stderr.strip().splitlines() or [f"exit status {run.returncode} without a message"]
     if run.returncode < 0:
-        # LLVM prints the reason first, then a stack trace.
+        # LLVM prints the reason for a crash first, and then a stack trace.
         return Check(name, False, f"killed by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
     # In a chain of exceptions, the first exception is the cause. If there is no exception, the last line is the exit
     # message.
@@ -181,12 +181,12 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
 
 
 def versions() -> tuple[tuple[str, str], ...]:
-    """Names and versions of Python, Calibray and each package that Calibray's metadata requires.
+    """Names and versions of Python, Calibray, and each package that Calibray's metadata lists as required.
 
     For a missing package, the command that installs the package is listed instead of a version.
     """
     packages = {"calibray": "pip install calibray"}
-    # A copy of the source has no metadata until it is installed.
+    # A copy of the source code has no metadata until it is installed.
     requirements = metadata.requires("calibray") if _version("calibray") else None
     for requirement in requirements or []:
         name, extra = _REQUIREMENT.findall(requirement)[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 LONGEST_MESSAGE: Final = 4000
-"""Maximum number of characters in a message; a limit is needed because values quoted from the input can be of any
+"""Maximum number of characters in a message; a limit is needed because a message can quote input values of any
 length."""
 
 
@@ -19,7 +19,7 @@ def _bounded(message: str) -> str:
 class InputError(ValueError):
     """Input that cannot be used.
 
-    The message states the location of the input (file, row, key), its value, the bound and the remedy. The command line
+    The message states where the input is (file, row, key), its value, the bound and the remedy. The command line
     prints only this message, without a traceback, and exits with status 2.
     """
 

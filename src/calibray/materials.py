@@ -26,7 +26,7 @@ FREQUENCIES: Final = (1e6, 1e12)
 
 
 def check_frequency(frequency: object, name: str = "frequency") -> float:
-    """Check a carrier frequency [Hz] and convert it to a float; error messages refer to the frequency as `name`.
+    """Check a carrier frequency [Hz] and convert it to a float; error messages call the frequency `name`.
 
     Raises:
         InputError: The frequency is not a number in the range `FREQUENCIES`.
@@ -112,21 +112,22 @@ SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Material:
-    """The radio constants of a surface, modelled as a slab of a homogeneous, non-magnetic medium.
+    """The radio constants of a surface, which is modelled as a slab of a homogeneous, non-magnetic medium.
 
     Attributes:
         relative_permittivity: Real part of the relative permittivity [1]; at least 1.
         conductivity: Conductivity [S/m], at least 0.
         thickness: Thickness of the slab [m], greater than 0.
-        scattering_coefficient: Scattering coefficient S [1], the fraction of the reflected amplitude that is scattered
-            diffusely, in [0, 1].
-        xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of diffuse fields, in [0, 1].
+        scattering_coefficient: Scattering coefficient S [1], in [0, 1]: the fraction of the reflected amplitude that is
+            scattered diffusely.
+        xpd_coefficient: Cross-polarization discrimination coefficient K_x [1], in [0, 1], of diffusely scattered
+            fields.
         scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Trans.
             Antennas and Propagation 55(1), 2007).
         alpha_r: Exponent [1] of the lobe around the specular direction, 1 to 126; for Sionna RT, the exponent is
             rounded.
         alpha_i: Exponent [1] of the lobe back towards the source, 1 to 126; for Sionna RT, the exponent is rounded.
-        lambda_: Fraction [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
+        lambda_: Fraction [1], in [0, 1], of the diffuse energy that is in the lobe around the specular direction.
 
     Raises:
         InputError: A constant is not a finite number within `BOUNDS`, or the pattern is unknown.
@@ -202,7 +203,7 @@ def frequency_independent_law(material: Material) -> ItuLaw:
 
 
 def law_with_stated(law: ItuLaw, material: Material, stated: Collection[str]) -> ItuLaw:
-    """The law of a material; the fields in `stated` have explicit values that do not depend on frequency."""
+    """The law of a material, with explicit values, independent of frequency, for the fields in `stated`."""
     # P.2040: permittivity a f^b, conductivity c f^d.
     if "relative_permittivity" in stated:
         law = law._replace(a=material.relative_permittivity, b=0.0)
@@ -217,7 +218,7 @@ def _table(rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
 
 
 def _extended(base: _Table, rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
-    """Append `rows` to the rows of `base`; where frequency ranges overlap, the rows of `base` apply."""
+    """Append `rows` to the rows of `base`; where their frequency ranges overlap, the rows of `base` apply."""
     return _table({name: (*base.get(name, ()), *rows.get(name, ())) for name in {**base, **rows}})
 
 

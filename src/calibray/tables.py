@@ -1,7 +1,7 @@
 """Tables as data, and functions that render tables and sentences as plain text and HTML.
 
-Control characters and markup are escaped, because some names come from files. The Python prompt and notebooks show
-shortened tables and sentences.
+Control characters and markup are escaped, because some names come from files. At the Python prompt and in notebooks,
+tables and sentences are shortened.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Final, Literal
 from calibray.support.messages import printable
 
 LISTED: Final = 12
-"""Maximum number of rows, names or findings in a list; the remaining items are only counted."""
+"""Maximum number of rows, names or findings in a list; further items are only counted."""
 
 WIDEST: Final = 100_000
 """Number of characters per line if the output is not a terminal or the terminal is too narrow; every cell fits in a
 line of this length."""
 
 ROWS: Final = 10
-"""Maximum number of table rows shown at the prompt; the remaining rows are only counted."""
+"""Maximum number of table rows shown at the prompt; further rows are only counted."""
 
 CHARACTERS: Final = 60
 """Maximum number of characters shown of a cell or a name; longer text is cut."""
@@ -52,7 +52,7 @@ class Column:
 
     @property
     def heading(self) -> str:
-        """The name with the unit in brackets."""
+        """The name, followed by the unit in brackets."""
         return " ".join(part for part in (self.name, self.unit and f"[{self.unit}]") if part)
 
 
@@ -107,7 +107,7 @@ class Table:
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """Shorten the table to its first `count` rows; if rows are left out, a last row states how many.
+        """Shorten the table to its first `count` rows; if rows are omitted, an additional last row states how many.
 
         Example:
             >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows
@@ -164,7 +164,7 @@ def rows_text(rows: Sequence[int]) -> str:
 
 
 def decibels(value: float | None) -> str:
-    """Format a value [dB] with two decimals for a table; an unknown value becomes a dash."""
+    """Format a value [dB] with two decimal places for a table; an unknown value becomes a dash."""
     return "-" if value is None else f"{value:.2f}"
 
 
@@ -215,7 +215,7 @@ def _lines(table: Table) -> str:
         show_header=table.headed, pad_edge=False, show_edge=False,
     )  # fmt: skip
     for index, (column, heading) in enumerate(zip(table.columns, table.headings, strict=True)):
-        # The first column contains the names of the rows; the only column of a table contains sentences.
+        # The first column contains the names of the rows; if a table has only one column, it contains sentences.
         is_text = column.align == "left" and (index > 0 or len(table.columns) == 1)
         # Rich uses the longest word as the minimum width, even for a cell that must not wrap.
         cells = (heading, *(row[index] for row in table.rows))

@@ -161,8 +161,7 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
     heading = "What should be measured next?"
     unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
     owners = dict.fromkeys(name.rpartition(".")[0] for name in unidentified)
-    # Some parameters do not belong to a material but, for example, to an antenna, so no path interacts with their
-    # owner.
+    # Some parameters belong, for example, to antennas, which are not materials with which paths interact.
     materials = [name for name in owners if name in result.materials]
     sentences = []
     # Suggestions need derivatives, which external programs do not provide.

@@ -336,7 +336,7 @@ def changed_files(result: Record, files: Mapping[str, str]) -> list[str]:
 
 
 def has_links(result: Record, links: Measurements) -> bool:
-    """Whether a calibration used these links, judged by measured values and positions (to the rounding in files)."""
+    """Whether a calibration used these links, judged by measured values and positions, up to rounding in files."""
     table, ends = result.links, result.ends
     pairs = [(table["measured_db"].to_numpy(float), links.path_loss_db)]
     pairs += [] if ends is None else [(ends, np.hstack([links.tx, links.rx]))]

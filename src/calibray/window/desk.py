@@ -2,8 +2,8 @@
 
 In this folder, the window uses only files that the command line also reads and writes.
 
-In 3-D, lengths are scaled so that the scene fits into a sphere of `RADIUS` around the origin, because the page's camera
-shows distances of 0.1 to 1000 units.
+In 3-D, lengths are scaled so that the scene fits into a sphere of radius `RADIUS` around the origin, because the page's
+camera shows distances of 0.1 to 1000 units.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ PLACE, CANDIDATES, SUGGESTED = "place.csv", "candidates.csv", "suggested.csv"
 positions."""
 
 PREDICTED: Final = "-predicted.csv"
-"""Suffix of the names of predicted tables."""
+"""Suffix of the names of tables of predictions."""
 
 LARGEST: Final = 2**30
 """Maximum size of an uploaded file [bytes]; larger files must be copied into the folder by other means."""
@@ -70,7 +70,7 @@ class StudyFolder:
 
     @property
     def study_file(self) -> Path:
-        """The study file, which might not exist yet."""
+        """Path of the study file, which might not exist yet."""
         return self.path / STUDY
 
     def files(self, endings: tuple[str, ...]) -> list[str]:
@@ -90,7 +90,7 @@ class StudyFolder:
         return sorted(name for name in names if not name.startswith("."))
 
     def results(self) -> list[str]:
-        """Names of the folders that contain results; the most recent result is last."""
+        """Names of the folders that contain results, with the most recent result last."""
         written = {
             file.parent.name: file.stat().st_mtime_ns
             for file in self.path.glob("*/result.json")
@@ -258,9 +258,9 @@ class Desk:
         findings: Warnings about suspicious links.
         solid: The scene that is shown in 3-D.
         entered: Values that the user entered, by the label of their control.
-        edits: Functions that copy the values shown in a step to the study's content, by tab and step.
-        show_again: Functions that redraw all steps after a change in a tab, by tab.
-        drawn: Content of the steps when they were last drawn; see `page`.
+        edits: Functions, by tab and step, that copy the values shown in a step to the study's content.
+        show_again: Functions, by tab, that redraw all steps after a change in that tab.
+        drawn: Content that the steps had when they were last drawn; see `page`.
     """
 
     folder: StudyFolder
@@ -295,7 +295,7 @@ class Desk:
         ui.run_javascript(f"plan.mark({json.dumps(self.point)}, {json.dumps(area)})")
 
     def keep(self, control: Control) -> Control:
-        """Restore the value entered in a control before its step was redrawn, if the value is still an option."""
+        """Restore the value entered in a control before its step was redrawn, if it is still one of the options."""
         name = control.text if isinstance(control, ui.switch) else str(control.props["label"])
         if name in self.entered and self.entered[name] in getattr(control, "options", [self.entered[name]]):
             control.set_value(self.entered[name])
@@ -352,7 +352,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
         return shown
     overhead = SceneSurfaces.read(source)
     roofed, wrong = overhead.under_roof(links.rx), overhead.outside(links.rx) | overhead.underground(links.rx)
-    # If more than 80 % of the receivers are under a roof, the scene counts as indoors.
+    # If more than 80 % of the receivers are under a roof, the scene is regarded as indoors.
     suspicious = wrong if roofed.mean() > 0.8 else wrong | roofed
     rows = zip(links.rx.tolist(), links.path_loss_db.tolist(), suspicious.tolist(), strict=True)
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]
@@ -362,7 +362,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 
 
 def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
-    """The transmitters of the links, once per group and carrier frequency, because a mast can carry several sectors.
+    """The transmitters of the links, one per position, group and carrier, because a mast can carry several sectors.
 
     Each transmitter has a `name`, a position `tx` [m], and the values of the `columns` that a prediction requires, such
     as azimuth.
@@ -373,8 +373,8 @@ def sites(study: Study, links: Measurements) -> list[dict[str, Any]]:
     tx = pd.DataFrame(links.tx.round(2), columns=["x", "y", "z"])
     # The first link of each mast, group and carrier frequency represents the other links.
     first = ~pd.concat([tx, columns[key].reset_index(drop=True)], axis=1).duplicated().to_numpy()
-    # Convert the rows via JSON, because NumPy numbers and NaN cannot be sent to the page. Without columns, JSON has no
-    # rows.
+    # Convert the rows to JSON and back, because NumPy numbers and NaN cannot be sent to the page. Without columns, JSON
+    # has no rows.
     rows = json.loads(columns[first].to_json(orient="records")) or [{}] * int(first.sum())
     return [
         {
@@ -415,7 +415,7 @@ def _geometry(source: str, study: Study | None) -> tuple[Scene, Triangles]:
 def grid_above_ground(
     folder: StudyFolder, scene: str | None, x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> NDArray[np.float64]:
-    """Points [n, 3], [m], of a grid with ascending, equally spaced x and y [m], at a height above the ground [m].
+    """Points [n, 3], [m], of a grid with ascending, equally spaced x and y [m], at a given height above the ground [m].
 
     Raises:
         InputError: There is no scene, or the scene cannot be read.
@@ -424,7 +424,7 @@ def grid_above_ground(
     if source is None:
         raise InputError("heights above the ground require a scene; make or add a scene first")
     _, triangles = _geometry(source, study)
-    # Compute the heights as for a coverage map, so that a place has the same height in both.
+    # Compute the heights as for a coverage map, so that a position has the same height in both.
     z = ground_heights(triangles, x, y) + height
     return np.stack([*np.meshgrid(x, y), z], axis=-1).reshape(-1, 3)
 

@@ -1,8 +1,8 @@
 """Commands that were started in a study's folder, from the window or from a terminal.
 
 Each command of the window is a separate process with three files in `.calibray-window`: `0001.json` describes the
-command, `0001.log` contains the output, and `0001.exit` contains the exit status. A command without an exit status and
-without a process has died; if the command is started again, its work is resumed.
+command, `0001.log` contains the output, and `0001.exit` contains the exit status. A command that has neither an exit
+status nor a process has died; if it is started again, it resumes its work.
 
 `python -m calibray.window.jobs` runs one command in its own session, so that the command outlives the server, and
 records the exit status. Ctrl-C is passed to the command, which keeps finished work.
@@ -35,7 +35,7 @@ WIDTH: Final = "80"
 """Number of characters per line in a command's tables."""
 
 TAIL: Final = 16_384
-"""Number of bytes shown from the end of a log, which is enough for a few screens."""
+"""Number of bytes shown at the end of a log, which is enough for a few screens of text."""
 
 
 _LINE: Final = re.compile(
@@ -50,7 +50,7 @@ class Job:
     """A command and its state.
 
     Attributes:
-        number: Number in the folder; 0 if the command was started from a terminal.
+        number: Number of the command in the folder; 0 if it was started from a terminal.
         words: Arguments of the command.
         state: "running", "done", "failed", "stopped" or "died".
         pid: Process ID.
@@ -102,7 +102,7 @@ class Jobs:
                     start_new_session=True, env={**os.environ, "COLUMNS": WIDTH},
                 )  # fmt: skip
             created = psutil.Process(child.pid).create_time()
-            # Without a wait, the ended process would stay in the process table. After the wait, `create_time` would
+            # Without this wait, the ended process would stay in the process table. After the wait, `create_time` would
             # fail.
             Thread(target=child.wait, daemon=True).start()
             record = {"words": list(words), "pid": child.pid, "created": created}
@@ -112,7 +112,7 @@ class Jobs:
         return Job(number, tuple(words), "running", child.pid)
 
     def list(self) -> list[Job]:
-        """The commands started in the folder; the most recent command is first."""
+        """The commands started in the folder, with the most recent command first."""
         files = sorted(self._folder.glob("[0-9]*.json"), reverse=True)
         return [job for job in map(_read, files) if job is not None]
 
@@ -152,7 +152,7 @@ class Jobs:
 
 @contextmanager
 def _held_back(number: signal.Signals) -> Iterator[None]:
-    """Block a signal in this thread and in the processes started by this thread, which inherit the block."""
+    """Block a signal in this thread and in the processes that it starts, which inherit the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield
@@ -202,7 +202,7 @@ class Stage:
 
     Attributes:
         name: Name of the stage.
-        share: Completed fraction, 0 to 1; None if unknown.
+        share: Completed fraction of the stage, from 0 to 1; None if unknown.
         seconds: Elapsed time [s].
         left: Remaining time [s]; None if unknown.
         best: Best value so far, such as "best RMSE 3.10 dB"; empty if the log contains no value.

@@ -64,7 +64,7 @@ def build(desk: Desk) -> None:
 
 
 def _show_map(desk: Desk, activity: Callable[[], None]) -> ui.label:
-    """Draw the map with its buttons, and the last command; return the label of the chosen position or area."""
+    """Draw the map with its buttons and the last command, and return the label of the chosen position or area."""
 
     def clear_area() -> None:
         desk.area = None
@@ -127,7 +127,7 @@ def _answer_map(desk: Desk, place: ui.label) -> None:
 def _contents(desk: Desk) -> dict[str, object]:
     """The content of the steps that are redrawn only if their content changes, by step, and the running command.
 
-    These steps have input fields, which lose the keyboard focus if they are redrawn.
+    These steps have input fields, which would lose the keyboard focus if they were redrawn.
     """
     text, files, job = desk.folder.text(), desk.folder.files((*MAPS, ".tif", ".tiff")), desk.jobs.running()
     return {
@@ -140,7 +140,7 @@ def _contents(desk: Desk) -> dict[str, object]:
 
 
 def _redraw(desk: Desk) -> None:
-    """Redraw, in all tabs, the steps whose content has changed and the steps whose content is not compared."""
+    """In all tabs, redraw the steps whose content has changed, and the steps whose content is not compared."""
     now = _contents(desk)
     for name, show in STEPS:
         if name not in now or now[name] != desk.drawn.get(name):
@@ -159,7 +159,8 @@ def _follow_changes(
         ui.run_javascript(f"plan.load({json.dumps(desk.scene)})")
 
     def follow() -> None:
-        # Without this update, `watch` would redraw the command, and a click on its Stop button would be lost.
+        # Without this update, `watch` would redraw the command, and a simultaneous click on its Stop button would be
+        # lost.
         watched.update(job=desk.jobs.running(), drawn=desk.drawn)
         activity.refresh()
         reload_map()

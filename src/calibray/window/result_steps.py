@@ -65,7 +65,7 @@ def show_run(desk: Desk) -> None:
 
 
 RESUMED: Final = frozenset({"run", "validate", "trace", "predict", "map", "suggest"})
-"""Commands that keep finished work: traces in the cache, or engine calls in the ledger."""
+"""Commands that keep finished work: traces in the cache or engine calls in the ledger."""
 
 
 @ui.refreshable
@@ -153,7 +153,7 @@ def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
 
 
 def _facts(desk: Desk, name: str) -> dict[str, str]:
-    """Key figures of a result, by name."""
+    """Key figures of a result, keyed by name."""
     record = desk.folder.result(name)
     facts = {
         "Links": _shown(record, "links", "calibrated_on"),
@@ -255,7 +255,7 @@ def better(first: str, second: str, folder: Path) -> str:
     """A sentence that states which of two results in a folder predicts held-out blocks better, and how certain this is.
 
     Raises:
-        InputError: Both names are the same, or a result or its validation cannot be read.
+        InputError: The two names are the same, or a result or its validation cannot be read.
     """
     if first == second:
         raise InputError(f"{first}: chosen twice; choose two different results")
@@ -383,7 +383,7 @@ def show_prediction(desk: Desk) -> None:
 def write_links(
     desk: Desk, file: str, site: dict[str, Any], x: NDArray[np.float64], y: NDArray[np.float64], height: float
 ) -> None:
-    """Write a table of links from a transmitter to a grid of positions x, y [m], at a height above the ground [m].
+    """Write a table of links from a transmitter to a grid of positions x, y [m], at a given height above ground [m].
 
     The links have the transmitter's groups, carrier frequency and antenna direction.
 
@@ -428,8 +428,8 @@ def _predicted(desk: Desk) -> None:
 def predicted_text(row: pd.Series) -> str:
     """A sentence with the predicted value of the measured quantity.
 
-    If received power was measured but the transmitted power is unknown, the sentence states a path loss that includes
-    this unknown power.
+    If received power was measured but the transmitted power is unknown, the sentence instead states a path loss that
+    includes this unknown power.
     """
     value, lower, upper, name, unit = "path_loss_db", "lower_db", "upper_db", "path loss", "dB"
     for key, quantity in QUANTITIES.items():

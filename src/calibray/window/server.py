@@ -53,7 +53,7 @@ def application(desk: Desk) -> FastAPI:
         except InputError as error:
             return JSONResponse({"links": [], "transmitters": [], "sites": [], "error": str(error)})
 
-    # The findings are served separately, so that the map does not have to wait for the findings.
+    # The findings are served separately, so that the map does not have to wait for them.
     @app.get("/data/findings.json")
     async def suspicions() -> Response:
         try:
@@ -98,7 +98,7 @@ def _listen(port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind(("127.0.0.1", port))
-        # From here on, connections are queued, so the address can be opened before the server is running.
+        # From here on, connections are queued, so a browser can open the address before the server is running.
         listening.listen()
     except (OSError, OverflowError) as error:
         listening.close()
@@ -128,7 +128,7 @@ class Guard:
     def __init__(self, app: Any, token: str, port: int) -> None:
         self._app, self._token, self._port = app, token.encode(), port
         self._hosts = {f"{name}:{port}".encode() for name in ("127.0.0.1", "localhost")}
-        # All ports of a host share cookies, so the name of the cookie contains the port.
+        # All ports of a host share their cookies, so the name of the cookie contains the port.
         self._cookie = f"calibray_{port}"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
@@ -159,7 +159,8 @@ class Guard:
         origins = {b"http://" + host for host in self._hosts}
         if b"origin" in headers and headers[b"origin"] not in origins:
             return "the request comes from another origin"
-        # A page from another port of this machine is same-site, so SameSite=Strict alone would not stop its requests.
+        # A page served from another port of this machine is same-site, so SameSite=Strict alone would not stop its
+        # requests.
         if headers.get(b"sec-fetch-site", b"none") not in {b"none", b"same-origin"}:
             return "the request comes from another site"
         return None
@@ -198,7 +199,7 @@ async def _answer(send: Any, status: int, body: bytes, headers: tuple[tuple[byte
 
 
 def _with_headers(send: Any) -> Any:
-    """Add the window's headers to all responses, and its content security policy to responses without such a policy."""
+    """Add the window's headers to all responses, and its content security policy to responses that have none."""
 
     async def sending(message: Any) -> None:
         if message["type"] == "http.response.start":

@@ -21,7 +21,7 @@ from calibray.window.desk import LARGEST, MAPS, STUDY, Desk, StudyFolder, filled
 
 ITU: Final = [name for name in ITU_MATERIALS[DEFAULT_REVISION] if name != "vacuum"]
 COMMANDS: Final = {".osm": "osm", ".pbf": "osm", ".csv": "plan", ".dxf": "plan"}
-"""The kind of conversion to a scene, by file extension; files with other extensions can be footprints or plans."""
+"""How a file is converted to a scene, by file extension; files with other extensions can be footprints or plans."""
 
 
 def upload(desk: Desk, label: str) -> None:
@@ -185,7 +185,7 @@ def show_measurements(desk: Desk) -> None:
         options = {
             "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
         }  # fmt: skip
-        # Each option is joined to its value, so that a negative x is not mistaken for an option.
+        # Each option is joined to its value, so that a negative value of x is not mistaken for an option.
         words += [f"{option}={value}" for option, value in options.items() if value]
         desk.start(words)
 
@@ -260,7 +260,7 @@ def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
 
 
 def _toml(value: Any) -> str:
-    """A value in the syntax of the study file."""
+    """A value, written in the syntax of the study file."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(part)}" for key, part in value.items()) + " }"
     if isinstance(value, list):
@@ -277,7 +277,7 @@ def _columns(desk: Desk, content: dict[str, Any]) -> list[str]:
 
 
 def likely_tables(folder: StudyFolder, tables: Sequence[str]) -> tuple[str, str]:
-    """The tables that most likely contain the links and the transmitters, judged first by columns and then by names.
+    """The tables that most likely contain the links and the transmitters, judged first by columns, then by file names.
 
     The second name is empty if no table looks like a table of transmitters.
     """
@@ -339,7 +339,7 @@ def show_parameters(desk: Desk) -> None:
 
 
 def _entry(name: str, entry: dict[str, Any]) -> Callable[[], dict[str, Any] | None]:
-    """Draw the controls of a parameter; return a function that reads its entry (None if not calibrated)."""
+    """Draw the controls of a parameter; return a function that reads its entry (None if it is not calibrated)."""
     low, high = map(float, entry["bounds"])
     prior = entry.get("prior", {})
     stated = prior.get("itu", "")
