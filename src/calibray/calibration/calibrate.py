@@ -71,7 +71,7 @@ def calibrate(
         study: The study, which may already be open.
         method: Method to use instead of that of the study: "auto", "sgwo-im", "gwo", ...
         seed: Seed to use instead of that of the study.
-        out: Folder to save the result in, which is checked before any computation. The ledger of RT calls is also
+        out: Folder in which the result is saved; it is checked before any computation. The ledger of RT calls is also
             written to this folder, so that a restarted run does not repeat completed calls. If `engine` is given, its
             calls are not stored.
         engine: Engine for all links of the study; if None, the engine that the study specifies. Predictions use the

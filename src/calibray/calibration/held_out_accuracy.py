@@ -205,7 +205,7 @@ def _groups_db(problem: Problem, block: NDArray[np.int64], links: NDArray[np.int
 
 
 def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
-    """Ratio of the RMS error of non-line-of-sight links to that of all links; 1 if unknown or modelled by a term."""
+    """RMS error of non-line-of-sight links, divided by that of all links; 1 if unknown or modelled by a nuisance."""
     terms = problem.objective.nuisance.terms
     table = problem.setup.with_obstruction().links.table
     if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:

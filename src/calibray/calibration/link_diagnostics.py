@@ -122,7 +122,7 @@ def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDAr
 
     Leverage is the diagonal of the projection onto two sets of columns: the derivatives of the residuals, with the
     nuisance eliminated [m, d], and the columns of the nuisance, scaled like the residuals [m, q]. Leverage is 0 for a
-    link without influence and 1 for a link that alone determines an unknown. The sum of leverage over all rows,
+    link without influence, and 1 for a link that determines an unknown on its own. The sum of leverage over all rows,
     including the rows of priors, is the number of unknowns that the rows determine.
 
     Example:
@@ -163,7 +163,8 @@ def _depth_and_power(paths: Paths, materials: dict[str, Material]) -> _Power:
     depth[paths.link[order]] = count[order]
     total = np.bincount(paths.link, power, paths.num_links)
     part = power / np.where(total > 0, total, np.inf)[paths.link]
-    # Each pair of material and kind has one code; a path counts once for each pair that occurs on the path.
+    # Each pair of material and kind of interaction has one code; a path counts once for each pair that occurs on the
+    # path.
     kinds = max(Kind) + 1
     path_of = np.repeat(np.arange(paths.num_paths), count)
     path_index, codes = np.unique(
@@ -239,7 +240,7 @@ def differing_groups(
     tested: list[Difference] = []
     for column, labels in columns.items():
         names = np.unique(labels)
-        # A column with more labels probably names links or positions.
+        # A column with more labels probably names individual links or positions.
         for name in names if 2 <= len(names) <= 50 else ():
             member = (labels == name).astype(float)
             inside = member - (np.bincount(cluster, member) / size)[cluster]

@@ -99,8 +99,8 @@ def predict_interval(
     without measurements, is the spread between groups.
 
     Raises:
-        InputError: `predict` would reject the input for a reason other than unknown groups, the level is not between 0
-            and 1, or the calibration had too few links to estimate the size of residuals.
+        InputError: `predict` would reject the input for a reason other than an unknown group, the level is not between
+            0 and 1, or the calibration had too few links to estimate the size of residuals.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     refuse_far_links(result, setup.links, read_triangles(setup.scene))

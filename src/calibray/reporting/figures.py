@@ -22,8 +22,8 @@ SYMBOLS: Final = 60
 """Maximum number of links that are drawn as symbols joined by a line."""
 
 FILE_ORDER: Final = 500
-"""Maximum number of links that are drawn in the order of the study's file, with held-out links shaded. If there are more
-links, they are sorted by measured path loss."""
+"""Maximum number of links that are drawn in the order of the study's file, with held-out links shaded.
+If there are more links, they are sorted by measured path loss."""
 
 RASTERIZED: Final = 2000
 """Maximum number of points that are drawn as vector graphics; if there are more, the points are rasterized."""

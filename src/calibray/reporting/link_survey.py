@@ -118,7 +118,7 @@ def _faint(table: pd.DataFrame) -> NDArray[np.bool_]:
 def survey(result: Record) -> Survey | None:
     """A calibration's links with positions; positions that the result lacks are read from the measurements.
 
-    The survey is None if the measurements cannot be read or have changed.
+    The function returns None if the measurements cannot be read or have changed.
     """
     table, sign = result.links, measured_quantity(result).sign
     if (ends := result.ends) is not None:

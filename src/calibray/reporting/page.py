@@ -241,7 +241,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
 
 
 def _title(study: Path) -> str:
-    """Name of a study: the folder name if the file is called study.toml, otherwise the file name."""
+    """Name of a study: the name of its folder if the file is called study.toml, otherwise the name of the file."""
     return (study.resolve().parent.name if study.stem == "study" else "") or study.stem
 
 
@@ -256,7 +256,7 @@ def _asset(name: str) -> str:
 
 
 def _tiles(result: Record) -> list[tuple[str, str, tuple[str, ...]]]:
-    """The key figures at the top of the page, each with a name, a value, and lines that compare it to other models."""
+    """The key figures at the top of the page: each has a name, a value, and lines that compare it with other models."""
     model, fit = result.prediction.model, result.fit
     judged = result.holdout_rmse_db is not None
     errors = (

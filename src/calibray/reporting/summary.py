@@ -57,7 +57,7 @@ class Sentence:
 
 
 def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
-    """Summarize a calibration in a few sentences: prediction model, fit, benefit, certainty, advice and warnings.
+    """Summarize a calibration in a few sentences: prediction model, fit, benefit, certainty, advice, and warnings.
 
     `links_by_material` contains, for each material, the number of links with a path that interacts with it; it is None
     if there are no paths.
@@ -180,7 +180,7 @@ def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iter
 
 
 def _coverage(count: int, total: int) -> str:
-    """Advice about a material that is not identifiable, based on the number of links whose paths interact with it."""
+    """Advice about an unidentifiable material, based on the number of links that have a path that interacts with it."""
     if count == 0:
         return (
             "no path of any link interacts with this material, so the links cannot identify it; measure links that "

@@ -202,7 +202,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
 def residuals_by_direction(result: Record) -> Figure | None:
     """Draw residuals versus the bearing of the receiver from the transmitter, with the horizontal antenna pattern.
 
-    The figure is None if the study does not state how the transmit antennas are mounted, or if the links cannot be read
+    No figure is drawn if the study does not state how the transmit antennas are mounted, or if the links cannot be read
     or have changed.
     """
     study = result.study

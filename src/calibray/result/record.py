@@ -76,8 +76,8 @@ class Fit:
         nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None if there are no
             nuisances.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
-        retrace_gap_db: Largest change in a calibration link's path loss when the scene is traced again with the
-            calibrated materials [dB]; None if the paths do not depend on the materials.
+        retrace_gap_db: Largest change [dB] in a calibration link's path loss when the scene is traced again with the
+            calibrated materials; None if the paths do not depend on the materials.
         power_shares: Share of the links' power by material and type of interaction, or under "line of sight" for paths
             without interactions. The shares can add up to more than 1, because a path contributes to the share of each
             of its interactions.
@@ -215,8 +215,7 @@ class Provenance:
 
     Attributes:
         files: SHA-256 digests of all files of the scene and the antennas, by path; empty if unknown.
-        rows: Numbers of table rows, by cause, that were left out, averaged or moved when the rows were converted to
-            links.
+        rows: Numbers of table rows that were left out, averaged or moved during conversion to links, by cause.
         enclosed: Antennas inside closed bodies of the scene or below the ground; None if this was not checked.
     """
 
@@ -292,7 +291,7 @@ class Record:
 
     @property
     def scene_laws(self) -> dict[str, dict[str, float]]:
-        """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, for the constants of `scene_materials`."""
+        """Coefficients of ITU-R P.2040 by material, as in `Fit.laws`, but for the constants in `scene_materials`."""
         # The values of the prediction model may differ from the calibrated values.
         values = self.prediction.model.parameters or {}
         return {
@@ -322,7 +321,7 @@ class Record:
 
     @property
     def counts(self) -> dict[str, Any]:
-        """Numbers of links, and the rows with possible problems.
+        """Numbers of links, and the rows of links with possible problems.
 
         Held-out links are counted only if the hold-out RMSE includes them.
         """

@@ -191,8 +191,8 @@ def averaged_terms(
     """The weighted mean of the terms of two models; the second model has all terms of the first.
 
     `weight` is that of the first model. If the first model lacks a term, the coefficients and spread of the term are
-    multiplied by the weight of the second model. If a group has a coefficient in only one model, this coefficient is
-    used.
+    multiplied by the weight of the second model. If a group has a coefficient in only one of the models, this
+    coefficient is used.
     """
     known, averaged = {term.name: term for term in few}, []
     for term in more:

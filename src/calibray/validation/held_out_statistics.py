@@ -48,7 +48,7 @@ MOST_CLUSTERS: Final = 1000
 RESAMPLES: Final = 2000
 
 LEAST_GAIN: Final = 0.05
-"""Minimum relative decrease of the RMSE for which another model is chosen. In Boulder, smaller decreases were due to a
+"""Minimum relative decrease in the RMSE for which another model is chosen. In Boulder, smaller decreases were due to a
 single block, and the fitted model was up to 3 dB worse on separately held-out clusters. With simulated misfits, every
 decrease was larger."""
 
@@ -60,7 +60,8 @@ AVERAGE_LINKS: Final = 8
 non-line-of-sight links. A few such links give little information about their own errors."""
 
 FEWEST_FOR_RANKS: Final = 40
-"""Minimum number of errors whose ranks determine an interval; for fewer errors, Student's t distribution is assumed."""
+"""Minimum number of errors for which their ranks determine an interval; for fewer, Student's t distribution is
+assumed."""
 
 
 def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:

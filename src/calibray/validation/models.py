@@ -236,8 +236,8 @@ MOST_NEW_STARTS: Final = 128
 """Maximum number of starting points if no minimum is known."""
 
 TOLERANCE: Final = 1e-6
-"""Relative decrease of the mean square error below which a search has converged; further iterations hardly change
-predictions."""
+"""Relative decrease in the mean square error below which a search is regarded as converged; further iterations hardly
+change predictions."""
 
 NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 

@@ -42,7 +42,7 @@ from calibray.validation.validation import Validation
 _LOG: Final = logging.getLogger(__name__)
 
 TX: Final = "tx"
-"""Name that stands for the position of the transmitter, unless the table has a column of this name."""
+"""Name that stands for the position of the transmitter, unless the table has a column with this name."""
 
 
 def validate(
@@ -196,7 +196,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
             link_labels = links.table.labels(by)
         names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
         labels = tuple(map(str, names))
-    # `fewest` links remain when the largest block is held out; the unknowns are fitted to these links.
+    # `fewest` links remain when the largest block is held out; all unknowns must then be fitted to these links.
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
     unknowns = counted.sum() - problem.freedom
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:

@@ -162,7 +162,7 @@ class StudyFolder:
             return ""
 
     def reasons(self) -> dict[str, str]:
-        """The reasons for drafted settings, from the study file's comments, by the dotted name of a section or key."""
+        """The reasons for drafted settings, from comments in the study file, by the dotted name of a section or key."""
         from calibray.study.toml_file import reasons_in
 
         return reasons_in(self.text())
@@ -257,7 +257,7 @@ class Desk:
         sites: Transmitters of the measured links, as listed by `sites`.
         findings: Warnings about suspicious links.
         solid: The scene that is shown in 3-D.
-        entered: Values that the user entered, by the label of their control.
+        entered: Values that the user entered, by the label of the control.
         edits: Functions, by tab and step, that copy the values shown in a step to the study's content.
         show_again: Functions, by tab, that redraw all steps after a change in that tab.
         drawn: Content that the steps had when they were last drawn; see `page`.

@@ -175,7 +175,7 @@ def _follow_changes(
 
     def watch() -> None:
         before, job, text = watched["job"], desk.jobs.running(), desk.folder.text()
-        # Only changed parts are redrawn, because a redrawn button loses the keyboard focus and may lose a click.
+        # Only changed parts are redrawn, because redrawing a button takes away its keyboard focus and may lose a click.
         if job is None or before is None or job.number != before.number:
             if job != before:
                 activity.refresh()
