@@ -272,7 +272,7 @@ def _worse_than_start(problem: Problem, trail: Trail, start_db: NDArray[np.float
 
 
 def _worse_than_mean(problem: Problem, found_db: float, log_distance_db: float) -> tuple[Remark, ...]:
-    """A remark if the calibrated model fits worse than the mean measured path loss, for example after a mix-up of links."""
+    """A remark if the calibrated model fits worse than the mean measured path loss, as when links are mixed up."""
     objective = problem.objective
     mean = np.average(objective.measured, weights=objective.weight)
     mean_db = rmse_of(problem, np.full(problem.num_links, mean), objective.weight > 0)

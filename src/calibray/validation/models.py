@@ -58,8 +58,8 @@ whatever the prior. Outdoors, waves travel around buildings. With a standard dev
 held-out cluster in Boulder was 17 dB."""
 
 ROUNDS: Final = 4
-"""Number of rounds; each round first estimates the RMS error, and then fits the losses with their priors. Further
-rounds change results by 0.01 dB."""
+"""Number of rounds; each round fits the losses with their priors and updates the RMS error. Further rounds change
+results by 0.01 dB."""
 
 LEAST_NOISE_DB: Final = 1.0
 """Lower limit [dB] on the RMS error of the log-distance model; this error determines the weight of the priors."""
