@@ -1,4 +1,4 @@
-"""A replay of the study's scene, used as a cheap model of an engine without derivatives.
+"""Cheap model of an engine without derivatives: a replay of the study's scene.
 
 We trace the study's scene once. Evaluating a candidate on the stored paths then takes microseconds. The engine may
 find paths that the study's settings leave out. We therefore trace the scene once more, with more interactions and with
@@ -41,20 +41,19 @@ BOUND: Final = 3.0
 """Distance from a constant's declared value to its bounds, in standard deviations."""
 
 GAIN: Final = (-1.2, 1.2)
-"""Mean and standard deviation of the logarithm of a layer's gain, by which the power of its paths is multiplied. An
-engine that finds these paths has a gain of about 1, and one that does not has a gain near 0; the bounds are 0.008 and
-11."""
+"""Mean and standard deviation of the logarithm of a layer's gain, the factor on the power of its paths. The gain is
+about 1 for an engine that finds these paths and near 0 for an engine that does not. The bounds are 0.008 and 11."""
 
 DEEPER: Final = 2
-"""Number of interactions that further paths may have in addition to those that the study allows. The planted engines
-have up to two more (`benchmarks/problem_families/family.py`)."""
+"""Number of interactions by which further paths may exceed the study's limit. The planted engines exceed it by up to
+two (`benchmarks/problem_families/family.py`)."""
 
 LONGEST_TRACE: Final = 60.0
 """Estimated duration of a trace above which no further paths are traced [s]."""
 
 WEAK: Final = 1e-2
 """Share of a link's power below which a further path is left out. In development offices 1018 and 63, with 297 and 449
-interactions, limits of 0.1, 0.3 and 1 % add 1,357 and 2,091, 923 and 1,298, and 451 and 583 interactions."""
+interactions, a limit of 0.1 % adds 1,357 and 2,091 interactions, 0.3 % adds 923 and 1,298, and 1 % adds 451 and 583."""
 
 METAL: Final = 1e4
 """Conductivity [S/m] above which a material reflects almost all power, regardless of its other constants."""
@@ -80,7 +79,7 @@ class StoredPaths(Protocol):
 
 
 class Rows(Protocol):
-    """Converts path loss and further observables to the residuals of a cheap model."""
+    """Converts path loss and further observables to the residuals that a cheap model predicts."""
 
     @property
     def wanted(self) -> tuple[Statistic, ...]:
@@ -100,7 +99,8 @@ class Rows(Protocol):
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, m, k] from those of path loss [n, L, k] and observables [n, K, L, k]."""
+        """Derivatives of the residuals [n, m, k], from the derivatives of path loss [n, L, k] and observables [n, K, L,
+        k]."""
         ...
 
     @property
@@ -109,14 +109,14 @@ class Rows(Protocol):
         ...
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask of the residuals that depend on links with a path [m]; `reached` marks these links [L]."""
+        """Mask [m] of the residuals that depend only on links with a path; `reached` [L] marks these links."""
         ...
 
 
 @final
 @dataclass(eq=False)
 class ReplayedModel:
-    """A replay used as a cheap model; its constants are those that the study does not calibrate.
+    """A replay used as a cheap model; its constants are the material constants that the study does not calibrate.
 
     Attributes:
         engine: The replay; its parameters are those of the study, followed by the material constants. Its links are
@@ -144,7 +144,7 @@ class ReplayedModel:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Mask of the residuals that the replay predicts [m]."""
+        """Mask [m] of the residuals that the replay predicts."""
         return self.rows.known(self._reached)
 
     @property
@@ -193,7 +193,8 @@ class ReplayedModel:
     def _respond(
         self, candidates: NDArray[np.float64], log_gain: NDArray[np.float64], derivatives: bool
     ) -> Responses:
-        """Responses to candidates [n, d], with the logarithms of the gains [n, layers]; derivatives include these."""
+        """Responses to candidates [n, d] with log gains [n, layers]; derivatives are also with respect to the log
+        gains."""
         if self.rows.wanted:
             return cast(Observing, self.engine).respond(candidates, self.rows.wanted, derivatives)
         none = np.zeros((len(candidates), 0, len(self._reached)))
@@ -209,7 +210,7 @@ class ReplayedModel:
     def _total(
         self, loss: NDArray[np.float64], log_gain: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of all layers together [n, L], [dB], and the share of each layer in the power [n, 1 + layers, L].
+        """Path loss [n, L], [dB], of all layers together, and the share of each layer in the power [n, 1 + layers, L].
 
         `loss` is the path loss of the study's paths and of each layer [n, (1 + layers) L].
         """
@@ -243,7 +244,7 @@ class ProblemRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The path loss ceiling or, if there is no ceiling, the measured path loss [L], [dB]."""
+        """The path loss ceiling [L], [dB]; the measured path loss if there is no ceiling."""
         objective = self.problem.objective
         if objective.ceiling_db is not None:
             return np.full(len(objective.measured), objective.ceiling_db)
@@ -280,10 +281,10 @@ class ProblemRows:
 
 @dataclass(frozen=True, eq=False)
 class CheapReplay:
-    """The cheap model of a calibration, or the reason why there is no model.
+    """The cheap model of a calibration, or the reason why there is none.
 
     Attributes:
-        model: The model; None if the study does not request a model or the model cannot be made.
+        model: The model; None if the study requests no model or the model cannot be made.
         remark: The reason why the model cannot be made.
     """
 
@@ -294,10 +295,10 @@ class CheapReplay:
 def make_cheap_replay(
     problem: Problem, progress: Progress | None = None, scene: Setup | None = None
 ) -> CheapReplay:
-    """Trace a problem's scene for a cheap model if the method uses such a model; if tracing fails, report the reason.
+    """Trace a problem's scene for a cheap model if the method uses one; if tracing fails, report the reason.
 
-    If `scene`, another study of the same links, is given, its scene is traced instead. The stages of `progress` are
-    "tracing" and "tracing more paths".
+    If another study of the same links is given as `scene`, that study's scene is traced instead. The stages of
+    `progress` are "tracing" and "tracing more paths".
     """
     setup = problem.setup
     section = setup.study.method
@@ -324,7 +325,7 @@ def make_cheap_replay(
 def _further_paths(
     problem: Problem, scene: Setup, paths: Paths, progress: Progress | None
 ) -> tuple[Paths, ...]:
-    """Layers of paths that the study's trace leaves out; none if path loss is not the sum of the powers of paths."""
+    """Layers of paths that the study's trace leaves out; none unless a link's power is the sum of its paths' powers."""
     study, trace = scene.study, scene.study.trace
     one_carrier = scene.links.frequency is None and not scene.parameters.has_laws
     summed = study.objective.combining == "power" and one_carrier and not scene.effects(paths)
@@ -343,8 +344,8 @@ def _further_paths(
 def further_layers(paths: Paths, max_depth: int, diffraction: bool) -> tuple[Paths, ...]:
     """The paths that a trace of at most `max_depth` interactions, with or without diffraction, leaves out.
 
-    There are up to three layers: paths with one interaction more, paths with more than one interaction more, and paths
-    with a diffraction if the trace finds none. Weak paths are left out, as are layers without paths.
+    There are up to three layers: paths with one interaction more than `max_depth`, paths with at least two more, and
+        paths with diffraction if the trace excludes diffraction. Weak paths and empty layers are left out.
     """
     interactions, power = np.diff(paths.first), powers(paths)
     strong = power >= WEAK * np.bincount(paths.link, power, paths.num_links)[paths.link]
@@ -357,7 +358,7 @@ def further_layers(paths: Paths, max_depth: int, diffraction: bool) -> tuple[Pat
 
 
 def with_layers(paths: Paths, layers: Sequence[Paths]) -> Paths:
-    """The paths and the layers of further paths as one program; its links are repeated for each layer."""
+    """The study's paths and the layers of further paths, joined; the links are repeated for each layer."""
     links = np.arange(paths.num_links)
     return join_links([(links + k * len(links), part) for k, part in enumerate((paths, *layers))])
 
@@ -369,7 +370,7 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Extend the parameters by the uncalibrated material constants, on a logarithmic scale.
+    """Add the uncalibrated material constants to the parameters, on a logarithmic scale.
 
     If the links have several carrier frequencies, constants that depend on frequency stay fixed.
     """

@@ -1,19 +1,19 @@
-"""Elimination of the nuisance: computes the best coefficients and projected derivatives for all candidates at once.
+"""Elimination of the nuisance: the best coefficients and the projected derivatives, for all candidates at once.
 
-Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
+In variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973), the coefficients b
 minimize sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. If each link has an entry in only one
 column, each coefficient is a clipped weighted mean.
 
 Otherwise the normal equations have an arrowhead matrix: diagonal blocks bordered by a few columns. Columns of different
-groups share no link, so they form separate blocks. Columns over all links overlap with every block and form the border.
-Block elimination solves the system in about the time needed to read the matrix, regardless of the number of groups.
+groups share no link, so they form separate blocks. Columns with entries at all links couple to every block and form the
+border. Block elimination solves the system in about the time needed to read the matrix, however many groups there are.
 
 Block principal pivoting (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block pivoting and
 interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of Computation 63,
 1994) enforces the bounds in all problems of a batch simultaneously. Each iteration fixes components outside their
 bounds at the bound, releases the fixed components whose gradient points inwards, and solves again. If the number of
-infeasible components stops decreasing, only the last infeasible component is exchanged (Murty's rule), which guarantees
-termination. The result meets the optimality conditions exactly, without a step length or a convergence tolerance.
+infeasible components stops decreasing, only the last one is exchanged (Murty's rule); this guarantees termination. The
+result meets the optimality conditions exactly, without a step length or a convergence tolerance.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ columns are projected out. Rounding leaves about 1e-16 per column."""
 
 PRIOR: Final = 1e-6
 """Weight of the prior on a linearly dependent column, relative to the squared norm of the column. In three of 600
-random problems with bounds, the sum of squares is then 3e-5 to 4e-4 above the minimum. With 1e-7, the coefficients lose
-one digit of accuracy."""
+random problems with bounds, this weight gives a sum of squares 3e-5 to 4e-4 above the minimum. With 1e-7, the
+coefficients lose one digit of accuracy."""
 
 ROUNDING: Final = 1e-11
 """Tolerance for bound violations and gradients due to rounding in double precision, relative to the size of the
 right-hand side."""
 
 PATIENCE: Final = 3
-"""Number of full exchanges without progress before single exchanges start."""
+"""Number of full exchanges without progress after which components are exchanged one at a time."""
 
 MAX_EXCHANGES: Final = 1000
-"""Maximum number of exchanges; the tested problems required far fewer."""
+"""Maximum number of exchanges; the tested problems needed far fewer."""
 
 Matrix = NDArray[np.float64] | sparse.csr_array
 
@@ -63,12 +63,12 @@ class Elimination:
         weighted: Z' W, with the diagonal matrix W of the weights [q, m].
         data: Z' W Z, the normal equations without priors [q, q].
         normal: The normal equations with priors; `order` states the order of their columns.
-        order: Index in the design of each column of `normal` [q].
+        order: Index, in the design, of each column of `normal` [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
         separable: Whether every link has an entry in at most one column.
-        determined: Mask of the columns that the links determine [q]. Among linearly dependent columns, the columns of
-            the finest grouping count as determined.
+        determined: Mask [q] of the columns whose coefficients the links determine. Of linearly dependent columns, those
+            of the finest grouping count as determined.
     """
 
     design: Matrix
@@ -105,16 +105,14 @@ class Elimination:
             lower=nuisance.lower,
             upper=nuisance.upper,
             separable=len(nuisance.terms) == 1,
-            # With a prior, even a column without links is independent of the others.
+            # With a prior, even a column without entries is independent of the others.
             determined=determined & (data.diagonal() > 0),
         )
 
     def coefficients(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best coefficients [n, q], [dB] per unit of the column.
-
-        The gap is measured minus modelled path loss at the links with nonzero weight [n, m], [dB]. An undetermined
-        coefficient takes the value nearest to 0 within its bounds, unless other coefficients then cannot reach the
-        minimum within their bounds.
+        """The best coefficients [n, q], in dB per unit of the column. `gap` [n, m] is measured minus modelled path loss
+        [dB] at the links with nonzero weight. An undetermined coefficient takes the value nearest to 0 within its
+        bounds, unless this value would keep other coefficients from reaching the minimum within their bounds.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -122,7 +120,7 @@ class Elimination:
         return self.minimum((self.weighted @ gap.T).T)
 
     def minimum(self, side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Like `coefficients` [n, q], but from sums over the links: the right-hand side Z' W gap [n, q].
+        """Like `coefficients`, but from sums over the links: the right-hand side Z' W gap [n, q].
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -139,10 +137,11 @@ class Elimination:
     def projection(
         self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for components at a bound.
+        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for coefficients at a
+        bound.
 
-        These coefficients are the negative derivatives of the best coefficients [n, q] with respect to the parameters.
-        `slope` contains the derivatives of the modelled path loss at the links with nonzero weight [n, m, d].
+        They equal minus the derivatives of the best coefficients [n, q] with respect to the parameters.
+        `slope` [n, m, d] contains the derivatives of the modelled path loss at the links with nonzero weight.
         """
         if isinstance(self.weighted, np.ndarray):
             side = self.weighted @ slope
@@ -153,7 +152,7 @@ class Elimination:
     def projection_from_sums(
         self, side: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Like `projection` [n, q, d], but from sums over the links: Z' W times the derivatives [n, q, d]."""
+        """Like `projection`, but from sums over the links: Z' W times the derivatives [n, q, d]."""
         # A coefficient at its bound does not depend on the parameters.
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
         projection = np.empty_like(side)
@@ -161,7 +160,8 @@ class Elimination:
         return projection
 
     def remove(self, slope: NDArray[np.float64], projection: NDArray[np.float64]) -> None:
-        """Subtract the projection [n, q, d] from derivatives at the links with nonzero weight [n, m, d], in place."""
+        """Subtract the projection [n, q, d] in place from the derivatives [n, m, d] at the links with nonzero
+        weight."""
         if isinstance(self.design, np.ndarray):
             slope -= self.design @ projection
             return
@@ -219,9 +219,10 @@ class Arrowhead:
         return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unconstrained minima [m, q, k] over the free components for right-hand sides [m, q, k]; the rest are zero.
+        """Unconstrained minima [m, q, k] over the free components for right-hand sides [m, q, k]; fixed components are
+        zero.
 
-        `free` is the mask of the free components [m, q].
+        `free` [m, q] is the mask of the free components.
         """
         problems, count, sides = side.shape
         if problems > 1 and (free == free[0]).all():  # all problems share one matrix
@@ -270,7 +271,7 @@ class Arrowhead:
     def _trial(
         self, side: NDArray[np.float64], free: NDArray[np.bool_], value: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Minimum over the free components, with the other components fixed at their values [m, q]."""
+        """Minimum [m, q] over the free components, with the other components fixed at their values."""
         rest = np.where(free, side - self._times(np.where(free, 0.0, value)), 0.0)
         if (free == free[0]).all():
             return self._solve(free[:1], rest.T[None])[0].T
@@ -284,7 +285,7 @@ class Arrowhead:
         inner = side[:, :split].reshape(len(side), groups, width, -1)
         solved = np.linalg.solve(blocks, np.concatenate([border, inner], axis=-1))
         across, within = solved[..., :edge], solved[..., edge:]
-        # Schur complement: the corner with the blocks eliminated.
+        # Schur complement: the corner after elimination of the blocks.
         schur = corner - np.einsum("mgbp,mgbr->mpr", border, across, optimize=True)
         outer = np.linalg.solve(schur, side[:, split:] - np.einsum("mgbp,mgbk->mpk", border, within))
         within = within - across @ outer[:, None]
@@ -293,7 +294,8 @@ class Arrowhead:
     def _restricted(
         self, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Blocks, border and corner, with rows and columns of the identity matrix for fixed components."""
+        """Blocks, border and corner, with the rows and columns of fixed components replaced by those of the identity
+        matrix."""
         groups, width, edge = self.border.shape
         inner, outer = free[:, : groups * width].reshape(-1, groups, width), free[:, groups * width :]
         return (
@@ -330,7 +332,7 @@ def _to_exchange(
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Mask of components to exchange [r, q]: all infeasible ones while their number decreases, then one of each part.
+    """Mask [r, q] of components to exchange: all infeasible ones while their number decreases, then one in each part.
 
     `infeasible` is the mask of the infeasible components [r, q] of the unsolved problems `pending` [r]. For each
     independent part [m, i], `fewest` (the smallest number so far) and `patience` (the remaining full exchanges without

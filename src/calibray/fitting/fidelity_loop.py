@@ -20,8 +20,8 @@ from calibray.support.progress import Progress, with_stage
 
 AROUND: Final = (0.0625, 0.125, 0.25, 0.5, 1.0)
 """Traced displacements on each side of a calibrated position, as fractions of the largest displacement. If the largest
-displacement is 8 m, the traced displacements are 0.5 to 8 m. The five inner positions are equidistant, so that the
-interpolation error can be estimated."""
+displacement is 8 m, they are 0.5 to 8 m. The five inner positions are equally spaced, so that the interpolation error
+can be estimated."""
 
 
 def retrace(
@@ -35,9 +35,9 @@ def retrace(
     budget of RT calls. The stage of `progress` is "checking".
 
     Returns:
-        The problem of the last calibration, its search, and the gap of every link [L], [dB]: path loss on paths traced
-        with the calibrated materials minus path loss on the paths of the calibration. The gap is None if the paths were
-        not traced again.
+        The problem of the last calibration, its search, and the gap [L], [dB]: each link's path loss on paths traced
+        with the calibrated materials, minus that on the paths of the calibration. The gap is None if the paths were not
+        traced again.
     """
     study, parameters = problem.setup.study, problem.parameters
     section = study.engine
@@ -67,7 +67,7 @@ def retrace(
         gap = path_loss_change(engine.path_loss(best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
-        # If all positions moved by at most the smallest traced displacement, a further trace gains nothing.
+        # If no position moved by more than the smallest traced displacement, a further trace gains nothing.
         settled |= displaced and bool((np.abs(best - before) <= near).all())
         if settled or study.method.name != AUTO or turn == rounds - 1:
             break
@@ -91,15 +91,15 @@ def retrace(
 def with_interpolation_error(
     objective: Objective, modelled: NDArray[np.float64], error_db: NDArray[np.float64]
 ) -> Objective:
-    """The objective with weights that account for the interpolation errors of the links' path loss [L], [dB].
+    """The objective with weights that account for interpolation errors in the links' path loss.
 
-    Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` is the
-    standard deviation of the interpolation error, in addition to a link's other errors. `error_db` is infinite for
-    links that are left out. The other errors are estimated from the residuals at the modelled path loss [L], [dB].
+    Interpolation errors are largest where paths appear or vanish between the traced positions. `error_db` [L] is the
+    standard deviation of each link's interpolation error [dB], which adds to its other errors; infinite values leave
+    links out. The other errors are estimated from the residuals for the modelled path loss [L], [dB].
     """
     counted = (objective.weight > 0) & np.isfinite(error_db)
     residual = (objective.model(modelled[None])[0] - objective.measured)[counted]
-    # Weights are relative to the mean weight, and the median is robust against links with large interpolation errors.
+    # Weights are relative to their mean. The median is robust against links with large interpolation errors.
     relative = objective.weight[counted] / objective.weight[counted].mean()
     variance = np.median(residual**2 * relative) / chdtri(1, 0.5) / relative
     weight = objective.weight.copy()
@@ -110,7 +110,7 @@ def with_interpolation_error(
 
 
 def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change in path loss [L], [dB]; 0 if neither trace has a path for the link, infinite if one trace has."""
+    """Change in path loss [L], [dB]; 0 if neither trace has a path for the link, infinite if only one trace has."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
 
@@ -121,7 +121,7 @@ def traced_again(path_loss_db: NDArray[np.float64], gap: NDArray[np.float64]) ->
 
 
 def largest_gap(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
-    """Largest gap of the links with nonzero weight and a path in both traces [dB]; None if `gap` is None."""
+    """Largest gap [dB] among links with nonzero weight and a path in both traces; None if `gap` is None."""
     if gap is None:
         return None
     return float(np.abs(gap[counted & np.isfinite(gap)]).max(initial=0.0))

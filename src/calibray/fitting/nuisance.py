@@ -1,4 +1,4 @@
-"""Nuisances: linear terms with unknown coefficients, which are added to the modelled path loss.
+"""Nuisances: linear terms with unknown coefficients, added to the modelled path loss.
 
 A term has one value per link: a constant (for an offset), the logarithm of the distance (for a slope per decade), or
 any numeric column of the table. A term has one coefficient for all links, or one coefficient per group. Several terms
@@ -48,11 +48,11 @@ class Term:
         by: The column: "constant", "log_distance", or a column of the links' table.
         value: The values of the column [L]: 1 for a constant; decades of distance relative to `centre` for
             "log_distance"; otherwise in the unit of the table.
-        group: Index of each link's group in `labels` [L]; -1 for a link that belongs to none of these groups.
+        group: Index [L] of each link's group in `labels`; -1 for a link in none of these groups.
         labels: Labels of the groups; one empty label if all links share one coefficient.
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
-        prior: Standard deviation of the coefficients' Gaussian prior around zero, in the unit of the bounds; +inf if
-            flat.
+        prior: Standard deviation of the coefficients' Gaussian prior around zero, in the unit of the bounds; +inf for a
+            flat prior.
         centre: Value subtracted from the column: for "log_distance", the mean of log10(distance / 1 m) over the links
             for which the term was made; otherwise 0.
         around: For the deviations of a random effect, the name of the term that contains the mean; otherwise "".
@@ -76,7 +76,8 @@ class Term:
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
         """The same term evaluated at other links, for prediction.
 
-        A link whose group label [n] is unknown belongs to no group. Pass no labels for a term without groups.
+        `labels` [n] are the labels of the links' groups; a link with an unknown label belongs to no group. Pass no
+        labels for a term without groups.
 
         Raises:
             InputError: The links' table lacks the column, or the labels do not match the term.
@@ -88,7 +89,8 @@ class Term:
         if labels is None:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
         link_labels = _labels(self.name, links, labels)
-        # The labels are sorted, so the index of an unknown label points to a neighbouring label, which differs.
+        # The labels are sorted, so the index found for an unknown label is that of a neighbouring label, which differs
+        # from it.
         index = np.minimum(np.searchsorted(self.labels, link_labels), len(self.labels) - 1)
         matches = np.array(self.labels)[index] == link_labels
         return replace(self, value=value, group=np.where(matches, index, -1))
@@ -108,9 +110,9 @@ def make_term(
     Args:
         links: The links.
         name: Name of the term.
-        by: "constant" for an offset [dB]; "log_distance" for a slope [dB per decade] about the links' geometric mean
-            distance; or a numeric column of the links' table.
-        labels: Labels of the links' groups [L], for one coefficient per group; if None, all links share one
+        by: "constant" for an offset [dB]; "log_distance" for a slope [dB per decade], centred at the links' geometric
+            mean distance; or a numeric column of the links' table.
+        labels: Labels [L] of the links' groups, each of which gets a coefficient; if None, all links share one
             coefficient.
         bounds: Lower and upper bound of the coefficients; unbounded if None.
         prior: Standard deviation of the coefficients' Gaussian prior around zero; flat if None.
@@ -149,7 +151,7 @@ def make_term(
 def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) -> tuple[Term, Term]:
     """The two terms of a random effect: a shared coefficient, and the deviation of each group from it.
 
-    `by` is as in `make_term`, and `labels` are the labels of the links' groups [L]. `estimate_noise` sets the prior
+    `by` is as in `make_term`, and `labels` [L] are the labels of the links' groups. `estimate_noise` sets the prior
     standard deviation of the deviations to the estimated spread.
     """
     deviations = make_term(links, deviations_of(name), by, labels=labels, prior=START_SPREAD)
@@ -162,7 +164,7 @@ def deviations_of(name: str) -> str:
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:
-    """Label each link with the position of its transmitter, rounded to the centimetre [L]."""
+    """Labels [L] of the links: the position of each link's transmitter, rounded to the centimetre."""
     return np.array([",".join(f"{value:z.2f}" for value in tx) for tx in links.tx], dtype=np.str_)
 
 
@@ -236,7 +238,7 @@ class Nuisance:
         """The design [L, q]: the row of a link has one entry for each term that has a group containing the link."""
         parts = [sparse.csr_array((self.num_links, 0))]
         for term in self.terms:
-            # A link that belongs to none of the groups has no entry.
+            # A link in none of the groups has no entry.
             row = np.flatnonzero(term.group >= 0)
             entries = (term.value[row], (row, term.group[row]))
             parts.append(sparse.csr_array(entries, shape=(self.num_links, len(term.labels))))
@@ -244,7 +246,7 @@ class Nuisance:
 
     @cached_property
     def layout(self) -> tuple[NDArray[np.int64], int, int]:
-        """Order of the columns for which the normal equations have an arrowhead form.
+        """Order of the columns that gives the normal equations an arrowhead form.
 
         Columns of different groups share no link, so the groups of one grouping form diagonal blocks.
 
@@ -264,14 +266,14 @@ class Nuisance:
         return order.astype(np.int64), groups, len(finest)
 
     def contribution(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Contribution of the nuisance to path loss [n, L], [dB]: design times coefficients [n, q]."""
+        """Contribution [n, L], [dB], of the nuisance to path loss: the design times the coefficients [n, q]."""
         return (self.design @ coefficients.T).T
 
     def filled(self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Coefficients [n, q]; each undetermined coefficient is replaced with the mean of its term's determined ones.
+        """Coefficients [n, q], with each undetermined one replaced by the mean of the determined ones of its term.
 
-        Undetermined deviations of a random effect keep their value of 0. `determined` is the mask of the determined
-        coefficients [q].
+        Undetermined deviations of a random effect remain 0. `determined` [q] is the mask of the determined
+        coefficients.
         """
         filled, first = coefficients.copy(), 0
         for term in self.terms:
@@ -283,9 +285,9 @@ class Nuisance:
         return filled
 
     def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Standard deviation, for each link, of the random effects that no other block determines [L], [dB].
+        """Standard deviation [L], [dB], for each link, of the random effects that no other block determines.
 
-        `block` is the index of each link's block, or -1 for a link that is not used [L].
+        `block` [L] is the index of each link's block, or -1 for a link that is not used.
         """
         variance = np.zeros(self.num_links)
         for term in self.terms:
@@ -300,12 +302,13 @@ class Nuisance:
     def by_term(
         self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> dict[str, dict[str, float]]:
-        """Determined coefficients [q] by term and group; a random effect's values are the mean plus the deviation."""
+        """Determined coefficients by term and group, from all coefficients [q]; a random effect's values are mean plus
+        deviation."""
         coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:
             last = first + len(term.labels)
-            # The term with the mean of a random effect precedes the term with its deviations.
+            # A random effect's mean precedes its deviations in the order of terms.
             shared = coefficient.get(term.around, {}).get("", 0.0)
             values = zip(term.labels, coefficients[first:last].tolist(), determined[first:last], strict=True)
             coefficient[term.around or term.name] = {

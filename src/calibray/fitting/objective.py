@@ -9,9 +9,9 @@ of squares is then minus twice the log posterior, in units of the noise variance
 the paper's RMSE over the links only. Without priors, `value` and `rmse` are equal.
 
 For many links, the objective is summed over chunks of links. For gaps g (measured minus modelled path loss),
-derivatives J, weights w and a nuisance's design Z, a chunk returns [J g]' w [J g] and Z' w [J g]. The sums of these
-products over all chunks give the normal equations with the nuisance eliminated. With A = [J g] and the best
-coefficients X of every column,
+derivatives J, weights w and the nuisance's design Z, each chunk returns [J g]' w [J g] and Z' w [J g]. The sums of
+these products over all chunks give the normal equations with the nuisance eliminated. With A = [J g] and the best
+coefficients X for every column of A,
 
     (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
 
@@ -38,10 +38,10 @@ from calibray.measurements import Measurements
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over links for n candidates and k columns: the derivatives, if requested, then the gap.
+    """Sums over links, for n candidates and k columns: first the derivatives, if requested, and then the gap.
 
     Attributes:
-        square: Products A'wA of the columns [n, k, k]; the square of the gap is infinite if any link has no path.
+        square: Products A'wA of the columns [n, k, k]; the squared gap is infinite if any link lacks a path.
         side: Products with the design Z'wA [n, q, k].
     """
 
@@ -52,7 +52,7 @@ class Sums:
 @final
 @dataclass(frozen=True, eq=False)
 class Share:
-    """The objective's data for one chunk of links; calling it with the path loss of these links returns their sums.
+    """The objective's data for one chunk of links; called with their path loss, it returns their sums.
 
     Attributes:
         links: Indices, within the chunk, of the m links with nonzero weight [m].
@@ -79,7 +79,7 @@ class Share:
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
         gap = self.measured - (loss if self.ceiling_db is None else np.minimum(loss, self.ceiling_db))
         lost = np.asarray(~np.isfinite(gap).all(axis=1))
-        # Candidates that leave a link without a path are marked below; their sums must stay finite here.
+        # Candidates without a path for some link are marked below; their sums must stay finite here.
         columns = np.where(lost[:, None], 0.0, gap)[..., None]
         if derivative is not None:
             slope = np.where((at_ceiling | lost[:, None])[..., None], 0.0, derivative[:, self.links])
@@ -118,7 +118,7 @@ class Objective:
         return replace(self, weight=weight, noise_db=self.noise_db * float(np.sqrt(before / after)))
 
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best coefficients of the nuisance [n, q], [dB] per unit of their columns, for path loss [n, L], [dB].
+        """The best coefficients [n, q] of the nuisance, in dB per unit of their columns, for path loss [n, L], [dB].
 
         Links without a path for a candidate are left out of the candidate's fit. A coefficient that is not `determined`
         takes the value nearest to 0 within its bounds.
@@ -129,7 +129,7 @@ class Objective:
         return self._fitted(self.measured - self.capped(path_loss))
 
     def completed(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The `coefficients` that are used to predict other links [n, q], from path loss [n, L], [dB].
+        """The coefficients [n, q] for predicting other links, from path loss [n, L], [dB].
 
         A coefficient that is not `determined` is set to the mean of the determined coefficients of its term. The
         determined coefficients are then fitted again.
@@ -143,7 +143,7 @@ class Objective:
         return np.where(self.determined, self._fitted(gap - added_db), filled)
 
     def _fitted(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The coefficients [n, q] that best fit the gap, measured minus modelled path loss [n, L], [dB]."""
+        """The coefficients [n, q] that best fit the gap [n, L]: measured minus modelled path loss [dB]."""
         if not self.nuisance.terms:
             return np.zeros((len(gap), 0))
         gap = gap[:, self._counted]
@@ -163,21 +163,22 @@ class Objective:
     def coefficient_slopes(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the best coefficients [n, q, d], from path loss [n, L] and its derivatives [n, L, d]."""
+        """Derivatives [n, q, d] of the best coefficients, from path loss [n, L] and its derivatives [n, L, d]."""
         if not self.nuisance.terms:
             return np.zeros((len(path_loss), 0, derivative.shape[2]))
         slope = self._slopes(path_loss, derivative)
         return -self._elimination.projection(slope, self.coefficients(path_loss))
 
     def coefficient_root(self) -> NDArray[np.float64]:
-        """Root R of the covariance R R' of the coefficients for given path loss [q, q]; large if not `determined`."""
+        """Root R [q, q] of the coefficients' covariance R R' for given path loss; large for undetermined
+        coefficients."""
         wide_prior = np.where(self.determined, np.inf, UNKNOWN_DB)
         gram = self._elimination.data.toarray() + np.diag(self._ridge**2 + (self.noise_db / wide_prior) ** 2)
         return self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """Mask of the columns that the links with nonzero weight determine [q].
+        """Mask [q] of the columns whose coefficients the links with nonzero weight determine.
 
         Examples of undetermined coefficients are the offset of a group whose links all have weight 0, or the slope of a
         group whose links all have the same distance.
@@ -188,7 +189,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Number of coefficients determined by the links, each weighted by the links' share of its precision.
+        """Effective number of coefficients that the links determine: the sum of the links' shares of each precision.
 
         Coefficients whose priors keep them at zero explain no residuals, regardless of the number of groups.
         """
@@ -199,9 +200,9 @@ class Objective:
 
     @property
     def supported(self) -> NDArray[np.bool_]:
-        """Mask of the links whose columns are all determined; the model of other links is incomplete [L].
+        """Mask [L] of the links whose columns are all determined; the model of other links is incomplete.
 
-        Deviations of a random effect are 0 unless links determine them.
+        A random effect's deviations are 0 unless links determine them.
         """
         terms = self.nuisance.terms
         deviates = np.repeat([bool(term.around) for term in terms], [len(term.labels) for term in terms])
@@ -212,7 +213,7 @@ class Objective:
         return self._model(path_loss, self.coefficients(path_loss))
 
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Residuals [n, links with weight + priors], [dB], whose root mean square is `value`, for path loss [n, L].
+        """Residuals [n, links with weight + priors], [dB], for path loss [n, L]; their root mean square is `value`.
 
         The residuals are (model - measurement) times the square root of the weights, followed by one row per
         coefficient with a prior.
@@ -224,7 +225,7 @@ class Objective:
     def jacobian(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, links with weight + priors, d], from derivatives of path loss [n, L, d]."""
+        """Derivatives [n, links with weight + priors, d] of the residuals, from derivatives [n, L, d] of path loss."""
         slope, prior_rows = self._slopes(path_loss, derivative), None
         if self.nuisance.terms:
             projection = self._elimination.projection(slope, self.coefficients(path_loss))
@@ -244,12 +245,12 @@ class Objective:
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 
     def rmse(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """RMSE [n], [dB], over the links only (paper eq. 1); +inf if a link with nonzero weight has no path."""
+        """RMSE [n], [dB], over only the links (paper eq. 1); +inf if a link with nonzero weight has no path."""
         links = self.residuals(path_loss)[:, : len(self._scale)]
         return np.sqrt(np.mean(links**2, axis=1))
 
     def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """The objective's share for each chunk of links; each share can be summed separately."""
+        """The part of the objective for each chunk of links; the chunks can be summed separately."""
         weight, shares = np.zeros(len(self.weight)), []
         weight[self._counted] = self._scale**2
         for chunk in chunks:
@@ -269,10 +270,9 @@ class Objective:
         return shares
 
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Squares and products of the residuals and of their derivatives, from sums over all links.
-
-        The results are the products of the k columns [derivatives, -residuals], including rows of priors [n, k, k], and
-        the sum of squares over the links only [n], [dB^2].
+        """Squares and products of the residuals and their derivatives, from sums over all links. The results are the
+        products [n, k, k] of the k columns (the derivatives and minus the residuals), including the rows of priors, and
+        the sum of squares [n], [dB^2], over only the links.
 
         Raises:
             EngineError: No minimum of the nuisance within its bounds was found.
@@ -297,7 +297,7 @@ class Objective:
 
     @property
     def num_counted(self) -> int:
-        """Number of links with nonzero weight; the remaining rows of the residuals belong to priors."""
+        """Number of links with nonzero weight; the residuals have one row for each, followed by the rows of priors."""
         return len(self._scale)
 
     def capped(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -305,7 +305,7 @@ class Objective:
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def with_nuisance(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [L], [dB], plus the nuisance fitted to links with nonzero weight.
+        """Path loss [L], [dB], plus the nuisance, which is fitted to the links with nonzero weight.
 
         Coefficients that these links do not determine are set to the mean of their term.
         """
@@ -338,7 +338,7 @@ class Objective:
 
     @cached_property
     def _ridge(self) -> NDArray[np.float64]:
-        """Ratio of the standard deviations of noise and priors [q]; 0 for a flat prior."""
+        """Ratio [q] of the standard deviation of the noise to that of each prior; 0 for a flat prior."""
         return self.noise_db / self.nuisance.prior
 
     @cached_property
@@ -357,7 +357,7 @@ def make_objective(
     ceiling_db: float | None = None,
     noise_db: float | None = None,
 ) -> Objective:
-    """Make the objective over the calibration links.
+    """Make the objective for the calibration links.
 
     Args:
         links: All links.
@@ -393,7 +393,7 @@ def make_objective(
 
 
 def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
-    """Add the sums of all chunks, in the order of `shares`, for a nuisance with `columns` columns."""
+    """Total of the chunks' sums, given in the order of `shares`, for a nuisance with `columns` columns."""
     square = np.zeros_like(parts[0].square)
     side = np.zeros((len(square), columns, square.shape[2]))
     for part, share in zip(parts, shares, strict=True):
@@ -412,7 +412,7 @@ def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     size = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
-    # Scale to a unit diagonal first; otherwise the rounding errors of large columns exceed the small columns.
+    # Scale to a unit diagonal first; otherwise rounding errors in large columns exceed the values in small columns.
     values, vectors = np.linalg.eigh(products / (size[:, :, None] * size[:, None, :]))
     root = np.sqrt(np.maximum(values, 0.0))
     return root[:, :, None] * vectors.transpose(0, 2, 1) * size[:, None, :]

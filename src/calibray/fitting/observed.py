@@ -1,7 +1,8 @@
 """Further observables in the objective; their residuals follow the residuals of path loss.
 
-Like the rows of the priors, these residuals are weighted by the ratio of the standard deviations of the errors. Up to
-constants, the sum of squares is therefore minus twice the log likelihood, in units of the noise variance of path loss.
+Like the rows of the priors, these residuals are scaled by a ratio of standard deviations: that of path loss errors to
+that of the observable's errors. Up to constants, the sum of squares is therefore minus twice the log likelihood, in
+units of the noise variance of path loss.
 An unknown bias is eliminated: its estimate is the mean residual of its group.
 """
 
@@ -42,7 +43,7 @@ class Observed:
         statistic: The modelled quantity.
         measured: Measured values [L], in the study's unit; NaN for a link without a value.
         scale: Size of the study's unit in SI units.
-        group: Index of the group of each link's bias [L]; -1 if there is no bias.
+        group: Index [L] of the group whose bias applies to each link; -1 if there is no bias.
         labels: Labels of the groups; empty if there is no bias.
         std: Standard deviation of a value's error, in the study's unit.
         stated: Whether the study states `std`.
@@ -69,13 +70,15 @@ class Observed:
     def residuals(
         self, modelled: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Modelled minus measured values [n, m] in the study's unit, with the bias removed, and the biases [n, groups].
+        """Modelled minus measured values [n, m], in the study's unit and with the bias removed, and the biases [n,
+        groups].
 
         Modelled values [n, L] are in SI units; the links have weights [L].
         """
         used = self.used(weight)
         gap = modelled[:, used] / self.scale - self.measured[used]
-        # If a link has no path for a candidate, its residual is 0, and the biases are estimated without this link.
+        # If a candidate leaves a link without a path, the link's residual is 0, and the biases are estimated without
+        # it.
         found = np.isfinite(gap)
         gap = np.where(found, gap, 0.0)
         if not self.labels:
@@ -84,9 +87,8 @@ class Observed:
         return np.where(found, gap - bias[:, self.group[used]], 0.0), -bias
 
     def slopes(self, derivative: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, m, k], from derivatives of the modelled values [n, L, k].
-
-        The derivatives of a link without a statistic are NaN.
+        """Derivatives [n, m, k] of the residuals, from derivatives [n, L, k] of the modelled values. The latter are NaN
+        for a link without a modelled value.
         """
         used = self.used(weight)
         slope = np.moveaxis(derivative[:, used] / self.scale, 2, 1)
@@ -99,7 +101,7 @@ class Observed:
     def _means(
         self, values: NDArray[np.float64], found: NDArray[np.bool_], used: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Mean of the finite values [..., m] over the links of each group [..., groups]; 0 for an empty group."""
+        """Mean [..., groups] of the finite values [..., m] over the links of each group; 0 for an empty group."""
         member = (self.group[used][:, None] == np.arange(len(self.labels))).astype(np.float64)
         return values @ member / np.maximum(found @ member, 1.0)
 
@@ -184,7 +186,7 @@ def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], t
 def with_errors(
     every: tuple[Observed, ...], modelled: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[Observed, ...]:
-    """The observables; errors that the study does not state are estimated from the residuals.
+    """The observables, with errors that the study does not state estimated from the residuals.
 
     Modelled values [K, L] are in SI units; the links have weights [L].
     """

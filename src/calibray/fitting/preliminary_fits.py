@@ -1,4 +1,4 @@
-"""Fits before the calibration; they exclude links near the noise floor, and estimate the noise and the spreads.
+"""Fits before the calibration, to exclude links near the noise floor and to estimate the noise and the spreads.
 
 Near the noise floor, a link is received only if its error is favourable. Selecting links by their measured values keeps
 these links and biases the fit. Selecting links by their predicted values causes no bias, because the prediction is
@@ -8,8 +8,7 @@ then refit it to the links whose predicted power is well above the floor, until 
 
 Residuals follow y = X b + Z u + e with u ~ N(0, lambda sigma^2) per group and e ~ N(0, sigma^2). X contains the columns
 of all other fitted terms. The restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971) accounts for
-the scatter that the fit of b removes; maximum likelihood does not account for this scatter and therefore underestimates
-the spread.
+the scatter that fitting b removes; maximum likelihood ignores this scatter and therefore underestimates the spread.
 
 Spreads of transmitters are estimated by expectation maximization with a Gaussian approximation at the optimum (D. Bates
 and S. DebRoy, J. Multivariate Analysis 91, 2004, section 5): the squared spread is the mean, over the transmitters, of
@@ -69,11 +68,11 @@ SEARCHES: Final = 32
 
 
 def leave_out_near_floor(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Give links with a predicted power near the noise floor a weight of 0, and mark them in `faint`.
+    """Give links with predicted power near the noise floor a weight of 0, and mark these links in `faint`.
 
-    The problem is unchanged if there is no noise floor. The problem is also unchanged for an engine without
-    derivatives, whose calls are expensive. If the remaining links determine fewer unknowns, the problem is unchanged
-    and a warning is logged. The stage of `progress` is "choosing links".
+    The problem is unchanged if there is no noise floor. It is also unchanged if the engine provides no derivatives,
+    because calls are then expensive. If the remaining links determine fewer unknowns, the problem is unchanged and a
+    warning is logged. The stage of `progress` is "choosing links".
     """
     limit, objective = problem.setup.links.limit_db, problem.objective
     if limit is None or not problem.differentiable:
@@ -116,7 +115,8 @@ def _far_from(
     objective: Objective,
     weight: NDArray[np.float64],
 ) -> Objective:
-    """The objective with weights [L] that are 0 for links with a predicted path loss above `largest_db` [L]."""
+    """The objective with a weight of 0 for each link whose predicted path loss exceeds its entry in `largest_db`
+    [L]."""
     return objective.reweighted(np.where(predicted_db <= largest_db, weight, 0.0))
 
 
@@ -145,8 +145,8 @@ def _warn_of_bias(problem: Problem, selected: Objective, faint: NDArray[np.bool_
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the noise level that scales the priors (unless the study declares it) and the spread of random effects.
 
-    The problem is unchanged without priors. On an engine without derivatives, calls are expensive, so the spread is
-    estimated at the initial values. The stage of `progress` is "estimating noise".
+    Without priors, the problem is unchanged. If the engine provides no derivatives, calls are expensive, so the spread
+    is estimated at the initial values. The stage of `progress` is "estimating noise".
 
     Raises:
         InputError: The noise is not declared and cannot be estimated.
@@ -203,7 +203,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
     """Estimate the spreads of a problem's random effects, at a point of the search space [d].
 
     The first result is the problem with these spreads. The second result is the standard deviation of a link's error
-    within the groups of the last effect [dB]. On an engine without derivatives, both results are estimated at the
+    within the groups of the last effect [dB]. If the engine provides no derivatives, both results are estimated at the
     initial values, for which path loss is known.
     """
     objective = problem.objective
@@ -213,7 +213,7 @@ def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tupl
     for index, term in enumerate(terms):
         if not term.around:
             continue
-        # With the deviations left out of the model, their scatter remains in the residuals.
+        # Without the deviations in the model, their scatter remains in the residuals.
         others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
         without = replace(problem, objective=replace(objective, nuisance=others))
         jacobian = None
@@ -265,7 +265,7 @@ class GroupSpread(NamedTuple):
 
     Attributes:
         between: Standard deviation between groups, in the unit of the residuals per unit of the column; 0 if the groups
-            do not differ, and `UNKNOWN_DB` if the links do not determine this standard deviation.
+            do not differ, `UNKNOWN_DB` if the links do not determine it.
         within: Standard deviation of individual links within a group, in the unit of the residuals.
     """
 
@@ -283,7 +283,7 @@ def group_spread(
 
     Args:
         residuals: Residuals of the links [n].
-        design: Columns X of the other fitted terms, with the derivatives of the model [n, k].
+        design: Columns X [n, k] of the other fitted terms, including the derivatives of the model.
         column: The column [n].
         group: Index of each link's group [n].
 
@@ -324,7 +324,7 @@ def group_spread(
 
 
 ROUNDS: Final = 20
-"""Maximum number of estimates; three suffice if the links determine the values of most transmitters well."""
+"""Maximum number of estimates; three suffice if the links determine most transmitters' values well."""
 
 LEAST: Final = 1e-3
 """Lower limit of a spread, as a fraction of the width of the bounds, which keeps the weights of the priors finite."""
@@ -333,7 +333,7 @@ LEAST: Final = 1e-3
 def estimate_spreads(problem: Problem, progress: Progress | None = None) -> Problem:
     """Estimate the spread of every population of transmitters for which the study states no spread.
 
-    The study and the priors of the returned problem contain the spreads. The stage of `progress` is "estimating
+    In the returned problem, the study and the priors contain the spreads. The stage of `progress` is "estimating
     spreads".
     """
     fields, parameters = estimated_fields(problem.setup.study), problem.parameters

@@ -40,7 +40,7 @@ class Evaluation(NamedTuple):
         modelled: The engine's values [n, L]; [n, 0] if the engine returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
         represents: Number of full residuals that the m compressed residuals represent; both have the same mean squares
-            and products. None if the residuals are not compressed.
+            and products. None if they are not compressed.
         observed: Further observables [n, K, L], in SI units; empty if the engine returned only sums.
     """
 
@@ -86,7 +86,7 @@ class Problem:
         before: The engine's values for the initial parameters [L].
         observable: The quantity that is measured and modelled.
         priors: Priors of the parameters.
-        faint: Mask of the links that are left out because they are censored or predicted near the noise floor [L]; None
+        faint: Mask [L] of the links that are left out because they are censored or predicted near the noise floor; None
             if no link is left out.
         observed: Further observables of the links; their residuals follow the residuals of path loss.
     """
@@ -102,7 +102,7 @@ class Problem:
 
     @classmethod
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:
-        """Set up a study's problem. This method runs the engine once, for the initial parameters.
+        """Set up a study's problem. The engine is run once, for the initial parameters.
 
         Raises:
             InputError: No calibration link is left, or a group has only held-out links.
@@ -145,7 +145,7 @@ class Problem:
 
     @property
     def statistics(self) -> tuple[Statistic, ...]:
-        """Statistics that the engine computes for the further observables."""
+        """Statistics that the engine must compute for the further observables."""
         return tuple(observable.statistic for observable in self.observed)
 
     @property
@@ -165,7 +165,7 @@ class Problem:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom: calibration links minus fitted unknowns; below 1, the noise cannot be estimated."""
+        """Degrees of freedom: calibration links minus fitted unknowns; if below 1, the noise cannot be estimated."""
         return self.objective.num_counted - len(self.parameters) - self.objective.fitted
 
     @cached_property
@@ -217,7 +217,7 @@ class Problem:
         """Like `evaluate`, for methods that use only squares and products of the residuals.
 
         If the engine divides the links into chunks, each chunk returns sums, and d + 1 compressed residuals represent
-        the residuals of all links. With any other engine, the residuals are not compressed.
+        all links. Otherwise, the residuals are not compressed.
         """
         if self._chunks is None:
             return self.evaluate(points, derivatives)
@@ -264,12 +264,13 @@ class Problem:
         )
 
     def modelled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The engine's values of all links [n, L] at points of the search space [n, d]."""
+        """The engine's values [n, L] for all links at points [n, d] of the search space."""
         return self.respond(self.parameters.from_search(points)).path_loss
 
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
-        """The engine that returns sums over its chunks, and the objective's share of each; None without chunks."""
+        """The engine that returns sums over its chunks, and the objective's share for each chunk; None without
+        chunks."""
         if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)
@@ -299,7 +300,7 @@ class Problem:
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Derivatives of `residuals` [n, m, k] with respect to k variables: the d search coordinates, then any others.
+        """Derivatives [n, m, k] of `residuals` with respect to k variables: the d search coordinates, then any others.
 
         The inputs are the derivatives of the modelled values [n, L, k] and of further observables [n, K, L, k].
         """
@@ -314,7 +315,7 @@ class Problem:
         return np.concatenate(parts, axis=1)
 
     def _further(self, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Residuals of each further observable [n, m], scaled to the standard deviation of path loss errors."""
+        """Residuals [n, m] of each further observable, scaled to the standard deviation of path loss errors."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
             noise_db / observable.std * observable.residuals(observed[:, index], weight)[0]
@@ -322,7 +323,7 @@ class Problem:
         ]
 
     def _further_slopes(self, slope: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Derivatives of the residuals in `_further` [n, m, k], from derivatives of the observables [n, K, L, k]."""
+        """Derivatives [n, m, k] of the residuals in `_further`, from derivatives [n, K, L, k] of the observables."""
         weight, noise_db = self.objective.weight, self.objective.noise_db
         return [
             noise_db / observable.std * observable.slopes(slope[:, index], weight)
@@ -345,7 +346,7 @@ class Problem:
 
 
 def _noise(study: StudyModel, weight: NDArray[np.float64]) -> float:
-    """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated.
+    """Declared standard deviation [dB] of a link's error at the mean weight; 1 until it is estimated.
 
     The weights are those of the calibration links [m].
     """
@@ -359,7 +360,7 @@ def _noise(study: StudyModel, weight: NDArray[np.float64]) -> float:
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:
-    """Reject held-out links that depend on a coefficient of the nuisance that no calibration link determines."""
+    """Reject held-out links that depend on nuisance coefficients that no calibration link determines."""
     unknown = np.flatnonzero(judged & ~objective.supported)
     if len(unknown):
         needed = objective.nuisance.design[unknown[:1]].toarray()[0] != 0
