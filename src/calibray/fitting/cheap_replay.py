@@ -109,7 +109,7 @@ class Rows(Protocol):
         ...
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask [m] of the residuals that depend only on links with a path; `reached` [L] marks these links."""
+        """Mask [m] of the residuals of links with a path; `reached` [L] marks these links."""
         ...
 
 

@@ -302,8 +302,7 @@ class Nuisance:
     def by_term(
         self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
     ) -> dict[str, dict[str, float]]:
-        """Determined coefficients by term and group, from all coefficients [q]; a random effect's values are mean plus
-        deviation."""
+        """Determined coefficients of all [q], by term and group; a random effect's values are mean plus deviation."""
         coefficient: dict[str, dict[str, float]] = {}
         first = 0
         for term in self.terms:

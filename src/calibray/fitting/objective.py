@@ -170,8 +170,7 @@ class Objective:
         return -self._elimination.projection(slope, self.coefficients(path_loss))
 
     def coefficient_root(self) -> NDArray[np.float64]:
-        """Root R [q, q] of the coefficients' covariance R R' for given path loss; large for undetermined
-        coefficients."""
+        """Root R [q, q] of the coefficients' covariance R R', given path loss; large for undetermined coefficients."""
         wide_prior = np.where(self.determined, np.inf, UNKNOWN_DB)
         gram = self._elimination.data.toarray() + np.diag(self._ridge**2 + (self.noise_db / wide_prior) ** 2)
         return self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))

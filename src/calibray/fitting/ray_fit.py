@@ -1,6 +1,6 @@
-"""Find an engine's assumptions from ratios of ray powers, by a global search over constants and polarizations.
+"""Find an engine's assumptions from ratios of ray powers by a global search over constants and polarizations.
 
-Materials are added one at a time. Each material is scanned (`ray_scan.py`) on the paths that meet none of the materials
+Materials are added one at a time. Each material is scanned (`ray_scan.py`) on the paths that do not meet any material
 added later. A least-squares fit to all these paths, with exact derivatives and several polarizations, then refines the
 best points jointly with the values already found. The best few explanations are kept. A further starting point combines
 the study's constants with the polarizations that fit best. If a misfit remains, linear polarizations are searched with
@@ -38,14 +38,15 @@ KNOWN_DB: Final = 0.02
 least 0.1 dB."""
 
 EVALUATIONS: Final = (6, 12, 30)
-"""Maximum number of evaluations for each loss function: in a trial, between scans, and in the last refinement."""
+"""Maximum number of evaluations for each loss function, in three cases: in a trial, between scans, and in the last
+refinement."""
 
 TRIALS: Final = 300
 """Maximum number of basin-hopping trials. Stopping after 150 trials without improvement gave about the same
 misfits."""
 
 TRIED_PATHS: Final = 500_000
-"""Maximum product of the number of trials and the number of paths, which limits the time spent on basin hopping."""
+"""Maximum of the number of trials times the number of paths, to limit the time spent on basin hopping."""
 
 PROMISING: Final = 3.0
 """A trial is refined further if its misfit is less than this multiple of the largest misfit among the explanations that
@@ -80,7 +81,7 @@ class Understanding:
 
 
 class Ratio(NamedTuple):
-    """Power ratios of the n paths that the last call has in common with an earlier call.
+    """Power ratios of the n paths that the last call shares with an earlier call.
 
     Attributes:
         call: The earlier call.
@@ -97,7 +98,7 @@ class Ratio(NamedTuple):
     observed: NDArray[np.float64]
 
     def on(self, kept: NDArray[np.bool_]) -> Ratio:
-        """The ratios of the paths selected by `kept`, a mask of the paths of the last call [P]."""
+        """The ratios of the paths selected by the mask `kept` [P] of the last call's paths."""
         mine = kept[self.here]
         return Ratio(self.call, self.here[mine], self.weight[mine], self.level_db[mine], self.observed[mine])
 
@@ -107,8 +108,8 @@ def understand(
 ) -> Understanding:
     """Find the assumptions that explain the ratios of all calls.
 
-    If `before`, the assumptions found from the earlier calls, is given, the search starts from these assumptions. The
-    model contains the paths of the last call. `known` states whether the program's antennas are those of the engine.
+    If `before` (the assumptions found from the earlier calls) is given, the search starts from it. The
+    model contains the paths of the last call. `known` is true if the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -127,9 +128,8 @@ def understand(
 
 
 def half_spaces(fit: Understanding, calls: list[Call]) -> tuple[str, ...]:
-    """Materials whose assumed thickness is not determined by the ratios of the calls, as for a half-space.
-
-    If a half-space replaces the slab of such a material, the misfit increases by at most `EXACT_DB`.
+    """Materials whose assumed thickness the ratios do not determine, as for a half-space. If the slab of such a
+    material is replaced by a half-space, the misfit increases by at most `EXACT_DB`.
     """
     last, ratios = calls[-1], ratios_of(calls)
     if not ratios:
@@ -176,7 +176,7 @@ def _search(
 
 
 def _hopped(fits: list[Understanding], ratios: list[Ratio], last: Call) -> Understanding:
-    """The best explanation from basin hopping, which refines perturbed explanations until one is exact."""
+    """The best explanation from basin hopping, which perturbs and refines explanations until one is exact."""
     random, model = np.random.default_rng(len(ratios)), fits[0].model
     for _ in range(min(TRIALS, TRIED_PATHS // model.paths.num_paths) if model.assumed else 0):
         if fits[0].misfit_db <= EXACT_DB:
@@ -194,8 +194,8 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
     """An explanation with different constants of one or two materials.
 
     A thickness changes by a whole number of half wavelengths in the slab, which leads to another resonance. The
-    conductivity stays the same, preserves the attenuation through the slab, or changes at random. One trial in three
-    also changes the tilts of the antennas if they are unknown.
+    conductivity stays the same, changes so that the attenuation through the slab is preserved, or changes at random.
+    One trial in three also changes the tilts of the antennas if they are unknown.
     """
     model, values = fit.model, fit.values.copy()
     materials = model.materials(last.candidate, fit.values)
@@ -218,7 +218,8 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
 
 
 def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with the same constants and the best polarizations of upright antennas; empty for known antennas.
+    """Explanations with the same constants and with upright antennas of the best polarizations; none for known
+    antennas.
 
     Many engines differ from the study only in their antennas.
     """
@@ -251,10 +252,10 @@ def _meetings(model: RayModel) -> tuple[NDArray[np.bool_], list[int]]:
 def _scanned(
     fits: list[Understanding], ratios: list[Ratio], last: Call, material: int, wanted: NDArray[np.bool_]
 ) -> list[Understanding]:
-    """Explanations with different constants of one material, from scans on the paths in the mask `wanted` [P].
+    """Explanations with different constants of one material, from scans on the paths selected by the mask `wanted` [P].
 
     One scan starts from the first explanation and uses upright antennas with all polarizations. Other scans use the
-    antennas of each explanation and so account for tilts.
+    antennas of each explanation, to account for tilts.
     """
     model, first = fits[0].model, np.isinf(fits[0].misfit_db)
     name = list(model.paths.materials)[material]
@@ -355,17 +356,16 @@ def refined(fit: Understanding, ratios: list[Ratio], last: Call, evaluations: in
 
 
 def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.float64]:
-    """Constants at the last call and at the earlier calls, evaluated for the paths of the last call."""
+    """Constants at the last call and at the earlier calls, for the paths of the last call."""
     return model.tables([last.candidate, *(ratio.call.candidate for ratio in ratios)])
 
 
 def _errors(
     fit: Understanding, ratios: list[Ratio], tables: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted errors of the ratios [m], [dB], and their derivatives with respect to the values [m, k].
-
-    If a path has power in the engine but not in the model, no correction can restore this power. The error of such a
-    path is `LEAST_DB` minus the power in the engine.
+    """Weighted errors [m], [dB], of the ratios, and their derivatives [m, k] with respect to the values. If a path has
+    power in the engine but not in the model, no correction can restore this power. Its error is then `LEAST_DB` minus
+    the power in the engine.
 
     `tables` contains the constants of the last call and of each ratio's call; see `_tables`.
     """
@@ -409,7 +409,7 @@ def common(one: Paths, other: Paths) -> tuple[NDArray[np.int64], NDArray[np.int6
             if (gap := float(np.abs(points - others).max(initial=0))) <= TOLERANCE
         ]
         taken = set()
-        # The nearest pairs come first, because both edges of a thin wall are within the tolerance of each other.
+        # The nearest pairs come first, because the two edges of a thin wall lie within the tolerance of each other.
         for _, index, k in sorted(near):
             if index not in partner and k not in taken:
                 partner[index] = k

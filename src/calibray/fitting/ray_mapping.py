@@ -3,12 +3,12 @@
 A few calls are enough. Each call returns the power of each path. The ratio of a path's powers between two calls does
 not depend on antenna gains or units. The ratios therefore reveal the engine's assumptions: thickness, conductivity,
 slabs or half-spaces, and the polarization of its antennas. We fit these assumptions to all ratios of the calls so far
-(`ray_fit.py`). The power of every path is then corrected to match the last call. The next call, at the minimum of this
-corrected replay, tests the replay.
+(`ray_fit.py`). The power of every path is then corrected to agree with the last call. The next call is at the minimum
+of this corrected replay and so tests the replay.
 
 The first call is at the initial values. The second call is at the point where the ratios are most informative about the
-assumed constants. This point has the largest mean log determinant of the information matrix among `PROBES` random
-points.
+assumed constants. Among `PROBES` random points, this point has the largest mean log determinant of the information
+matrix.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ DRAWN: Final = 3.0
 """Maximum factor between an assumed constant in one of the `DRAWS` sets and the study's value."""
 
 SIGMA_DB: Final = 0.1
-"""Standard deviation of the error of a ratio that the information matrix assumes [dB]."""
+"""Standard deviation of a ratio's error that the information matrix assumes [dB]."""
 
 LEFT_DB: Final = 0.05
 """An optimum counts as reached only if the best call and the minimum of the replay differ by at most this much, in the
@@ -56,8 +56,8 @@ objective and in RMS path loss [dB]."""
 
 GAP_DB: Final = 0.2
 """An optimum counts as reached only if the gap at the last call is at most this large [dB]. After six calls, the excess
-RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB. The excess RMSE was 0.020 to 0.15 dB in eight runs
-with gaps above 0.36 dB."""
+RMSE was at most 0.016 dB in six runs with gaps of 0.06 to 0.17 dB, and 0.020 to 0.15 dB in eight runs with gaps above
+0.36 dB."""
 
 MISFIT_DB: Final = 0.2
 """An engine counts as understood only if the misfit of its ratios is at most this large [dB]. With misfits of 0.07 to
@@ -85,14 +85,14 @@ class RayMap:
 
     Attributes:
         engine: Replay that agrees with the engine at the best call.
-        calls: The calls; from the third on, each is at the minimum of the replay that was fitted to the earlier calls.
+        calls: The calls; from the third call on, each is at the minimum of the replay fitted to the earlier calls.
         best: The call with the lowest objective.
         understanding: The assumptions that explain the engine.
         gap_db: RMS difference, over the links, between the engine's path loss and the predicted path loss at the last
             call [dB].
         changed: Largest number of paths that occur in the best call but not in another call, or vice versa.
-        changed_db: Largest change in the path loss of a link if these paths are left out, among the links that keep a
-            path [dB].
+        changed_db: Largest change [dB] in a link's path loss if these paths are left out, among the links that keep a
+            path.
         lost: Number of links that lose all their paths, or that have no path in the replay at the best call.
         half_spaces: Materials whose thickness the calls do not determine.
         minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
@@ -127,8 +127,8 @@ class RayMap:
     def understood(self) -> bool:
         """Whether the optimum is reached, the model explains all calls, and the calls share their strong paths.
 
-        The replay then represents the engine at other candidates as well. Ratios of paths without a calibrated material
-        are 1 with any model, so these ratios explain nothing.
+        The replay then represents the engine at other candidates as well. For paths without a calibrated material, the
+        ratios are 1 in any model, so they reveal nothing.
         """
         model = self.understanding.model
         explained = model.meets_calibrated and self.understanding.misfit_db <= MISFIT_DB
@@ -157,7 +157,7 @@ def _most_calls(setup: Setup) -> int:
 def search_rays(
     problem: Problem, engine: Exporting, progress: Progress | None = None
 ) -> tuple[Problem, Trail, Remark]:
-    """Search by ray mapping on an engine that returns its rays.
+    """Search by ray mapping, with an engine that returns its rays.
 
     Returns the problem on the replay that replaces the engine, the search, and a remark on how well the engine's
     assumptions are identified. The stage of `progress` is "calibrating".
@@ -194,8 +194,8 @@ def map_rays(
 
     The result contains the replay that replaces the engine, and the accuracy of this replay. Calls also continue if the
     minimum of the replay is not at the best call: an accurate prediction over a short step does not show that the model
-    is accurate elsewhere. Calls end if links have lost all their paths in two successive calls at minima. The engine is
-    called through `ask`; the engine of `problem` is not called.
+        is accurate elsewhere. Calling stops if links lose all their paths in two successive calls at minima. The engine
+        is called through `ask`, never through `problem`.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None
@@ -229,7 +229,7 @@ def map_rays(
         )
         if mapped.moved_db <= LEFT_DB or repeated or len(calls) >= most_calls:
             return mapped
-        # The model contains the rays of the last call in this order.
+        # The model contains the rays of the last call, in this order.
         ordered, understanding = _best_last(problem, calls), mapped.understanding
         further = mapped.minima[:1]
 
@@ -246,7 +246,7 @@ def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64]
 def _finish(
     problem: Problem, calls: list[Call], known: bool, understanding: Understanding, gap: float
 ) -> RayMap:
-    """The ray mapping with the replay that agrees with the engine at the best call."""
+    """The ray mapping, with the replay that agrees with the engine at the best call."""
     parameters, ordered = problem.parameters, _best_last(problem, calls)
     final, best = understand(parameters, ordered, known, understanding), ordered[-1]
     replay = final.replay(parameters, best)
@@ -289,13 +289,13 @@ def _gap(replay: Replay, call: Call) -> float:
 
 
 def _distance(path_loss: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """RMS difference over the links that have a path in both [dB]; +inf if there are no such links."""
+    """RMS difference [dB] over the links that have a path in both; +inf if there are no such links."""
     both = np.isfinite(path_loss) & np.isfinite(other)
     return float(np.sqrt(np.mean((path_loss[both] - other[both]) ** 2))) if both.any() else np.inf
 
 
 def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
-    """The candidate at which the ratios to the first call are most informative about the assumed constants [d]."""
+    """The candidate [d] at which the ratios to the first call are most informative about the assumed constants."""
     known = problem.setup.known_antennas is not None
     model = RayModel.of(problem.parameters, call.export.paths, known)
     probes = problem.parameters.from_unit(design("sobol", PROBES, len(problem.parameters), random))
@@ -314,10 +314,9 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
 
 
 def _changes(calls: list[Call]) -> tuple[int, float, int]:
-    """Largest number of paths that occur in the last call but not in another call, or vice versa, and their effect.
-
-    The second result is the largest change in path loss if these paths are left out [dB]. The third result is the
-    largest number of links that lose all their paths.
+    """Largest number of paths that occur in the last call but not in another call, or vice versa, and their effect. The
+    second result is the largest change in path loss [dB] if these paths are left out. The third result is the largest
+    number of links that lose all their paths.
     """
     last, changed, change_db, lost = calls[-1].export, 0, 0.0, 0
     for call in calls[:-1]:
@@ -348,7 +347,7 @@ def _remark(mapped: RayMap, problem: Problem) -> Remark:
     return Remark(
         RemarkKind.RAY_MAPPING,
         {
-            # A value is infinite if the calls have no path or no link in common.
+            # A value is infinite if the calls share no path or no link.
             **{name: value for name, value in levels.items() if np.isfinite(value)},
             "understood": mapped.understood,
             "reached": mapped.reached,

@@ -38,11 +38,11 @@ from calibray.paths import Paths
 from calibray.tracing.antennas import wave_basis
 
 HALF_SPACE: Final = 1e4
-"""Thickness that represents a half-space [m]: a wave decays within this thickness unless the conductivity is below 1e-6
-S/m."""
+"""Thickness [m] that represents a half-space; a wave decays within it unless the conductivity is below 1e-6 S/m."""
 
 DECAYED: Final = 4.0
-"""Attenuation in a slab [Np] above which the slab acts as a half-space: the wave returns with e^-8 of its amplitude."""
+"""Attenuation in a slab [Np] above which the slab acts as a half-space, because the wave returns with only e^-8 of its
+amplitude."""
 
 RANGES: Final = {"thickness": (5e-4, HALF_SPACE), "conductivity": (1e-7, 1e3)}
 """Ranges of the assumed constants, in physical units."""
@@ -119,7 +119,7 @@ class RayModel:
 
     @cached_property
     def start(self) -> NDArray[np.float64]:
-        """The values [k] of the study's constants and, if antennas are unknown, of vertical polarization."""
+        """The values [k] for the study's constants and, if the antennas are unknown, for vertical polarization."""
         constants = [np.log(getattr(self.paths.materials[name], field)) for name, field in self.assumed]
         return np.array(constants + [0.0] * (0 if self.known else 2 * ANGLES))
 
@@ -142,7 +142,7 @@ class RayModel:
     def levels_and_slopes(
         self, tables: NDArray[np.float64], values: NDArray[np.float64], linear: Ends
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Power of every path [n, P], [dB], and its derivatives with respect to the values [n, P, k].
+        """Power [n, P], [dB], of every path, and its derivatives [n, P, k] with respect to the values.
 
         The n candidates are given by their constants [n, M, 8]. The assumed values [k] are the same for all candidates.
         """
@@ -174,7 +174,7 @@ class RayModel:
         return np.concatenate(levels), np.concatenate(slopes)
 
     def gains(self, candidate: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Gain of every path between the ports [P, R, T], at a candidate [d] with the assumed values [k]."""
+        """Gain [P, R, T] of every path between the ports, at a candidate [d] with the assumed values [k]."""
         with jax_settings():
             table = self.paths.material_table(self.materials(candidate, values))
             real, imaginary = map(np.asarray, program_gains(self._layout.program, jnp.asarray(table)))
@@ -212,7 +212,7 @@ class RayModel:
 
     @cached_property
     def bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Unit vectors theta and phi of the fields at both ends [P, 2, 3]."""
+        """Unit vectors theta and phi [P, 2, 3] of the fields at both ends."""
         departure, arrival = (
             np.moveaxis(wave_basis(angles)[1:], -1, 0)
             for angles in (self.paths.departure, self.paths.arrival)
@@ -231,7 +231,7 @@ class RayModel:
     def _by_path(self) -> tuple[GroupedProgram, Polarized]:
         """The program with one link per path, and the polarization of its antennas."""
         count = self.paths.num_paths
-        # The path loss of such a link is minus the power of its path in dB, regardless of the phase.
+        # The path loss [dB] of such a link is minus the power of its only path, whatever the phase.
         nowhere = np.zeros((count, 3))
         plan = layout(
             replace(self.paths, link=np.arange(count), tx_position=nowhere, rx_position=nowhere), phases=False

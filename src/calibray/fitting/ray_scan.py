@@ -1,14 +1,14 @@
-"""Scans of a material's constants and of antenna angles; they give starting points for a fit to ratios of path powers.
+"""Scans of a material's constants and of antenna angles, which give starting points for a fit to ratios of path powers.
 
 A slab resonates: the power of a ray varies periodically with the thickness, and the period is half a wavelength. A
-local search can therefore end in a wrong minimum. A scan evaluates a fine grid of thicknesses up to the depth where the
-wave has decayed. The grid is evaluated for several conductivities and for several polarizations at both ends. A scan
-uses only paths that consist of reflections and transmissions.
+local search can end in a wrong minimum. A scan therefore evaluates a fine grid of thicknesses, up to the depth at which
+the wave has decayed. The grid is evaluated for several conductivities and for several polarizations at both ends. A
+scan uses only paths that consist of reflections and transmissions.
 
-An antenna receives almost no power from a direction in which the wave is orthogonal to its polarization. Every path
+An antenna receives almost no power from a direction where the wave is orthogonal to its polarization. Every path
 near such a null adds a minimum of the misfit. These minima are about 0.02 rad apart, so a local search from upright
 antennas ends in a wrong minimum. With the materials fixed, the gain of a path is bilinear in the polarizations of both
-ends. A scan therefore evaluates a grid of slants and tilts at one end; the other antenna is first as fitted and then
+ends. A scan therefore evaluates a grid of slants and tilts at one end, with the other antenna first as fitted and then
 upright. Local searches over all angles start from the best points of this grid.
 """
 
@@ -45,14 +45,14 @@ RESOLUTION: Final = 20.0
 """Number of scanned thicknesses per wavelength in the slab; a slab has two resonances per wavelength of thickness."""
 
 ROBUST_DB: Final = 1.5
-"""Error of a ratio above which its weight decreases [dB]: near a resonance, where a ray has almost no power, one step
+"""Error of a ratio above which its weight decreases [dB]: near a resonance that leaves a ray almost no power, one step
 of a scan changes the ratio by tens of dB."""
 
 SCANNED: Final = 48
 """Maximum number of paths evaluated in a scan."""
 
 KEPT: Final = 3
-"""Number of local minima that are kept from each scan of a material, and from a search over antennas."""
+"""Number of local minima that are kept from each scan of a material and from each search over antennas."""
 
 BATCH: Final = 512
 """Number of points that are evaluated together."""
@@ -77,7 +77,7 @@ FINE_SLANTS: Final = np.pi * (np.arange(80) / 80 - 0.5)
 
 
 def robust(square: Any) -> Any:
-    """Geman-McClure loss [dB^2] of squared errors of ratios [...], [dB^2], as a NumPy or JAX array."""
+    """Geman-McClure loss [...], [dB^2], of squared errors of ratios [...], [dB^2], as a NumPy or JAX array."""
     return square / (1 + square / ROBUST_DB**2)
 
 
@@ -171,7 +171,7 @@ def _grid(
 def _minima(
     grid: NDArray[np.float64], square: NDArray[np.float64], fields: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The lowest local minima over thickness, each at the best conductivity [H, K, c], and their losses [H, K]."""
+    """The lowest local minima [H, K, c] over thickness, each at the best conductivity, and their losses [H, K]."""
     pairs = square.shape[1]
     values, misfit = np.zeros((pairs, KEPT, grid.shape[1])), np.full((pairs, KEPT), np.inf)
     _, group = np.unique(
@@ -179,7 +179,7 @@ def _minima(
     )
     for pair in range(pairs):
         order = np.lexsort((square[:, pair], group))
-        # The best conductivity of every thickness.
+        # The best conductivity for every thickness.
         first = order[np.flatnonzero(np.diff(group[order], prepend=-1))]
         lowest = square[first, pair]
         # Either end of the range can be a minimum.
@@ -196,7 +196,7 @@ class _Scanned(NamedTuple):
     P is always `SCANNED`, so that few functions have to be compiled. Missing paths have weight 0.
 
     Attributes:
-        exists: Whether a path has an interaction with this index [D, P].
+        exists: Whether a path has an interaction at this index [D, P].
         here: Whether an interaction is on the scanned material [D, P].
         cosine: Cosine of the angle of incidence [D, P].
         through: Whether the interaction is a transmission [D, P].
@@ -255,7 +255,7 @@ def _losses(program: _Scanned, points: jax.Array, columns: tuple[int, ...], know
     last, *earlier = (_powers(program, each, points, columns, known) for each in program.constants)
     total = jnp.zeros(last.shape[:2])
     for power, weight, change_db in zip(earlier, program.weight, program.change_db, strict=True):
-        # Single precision is enough for a logarithm.
+        # Single precision suffices for a logarithm.
         ratio = (jnp.maximum(last, 1e-30) / jnp.maximum(power, 1e-30)).astype(jnp.float32)
         square = (10 * jnp.log10(ratio) - change_db.astype(jnp.float32)) ** 2
         total += (robust(square) * weight.astype(jnp.float32)).sum(axis=-1)
@@ -368,7 +368,7 @@ def errors(parts: list[Gains], angles: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _scan_angles(parts: list[Gains], end: int, other: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Sets of angles [3] at one end with the smallest losses, for given angles at the other end."""
+    """Sets of angles [3] with the smallest losses at one end, for given angles at the other end."""
     x, y = (each.ravel() for each in np.meshgrid(TILTS, TILTS))
     axis, loss = np.stack([x, y, np.ones_like(x)], axis=1), 0.0
     cos, sin = np.cos(FINE_SLANTS)[:, None], np.sin(FINE_SLANTS)[:, None]

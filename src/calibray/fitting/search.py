@@ -32,8 +32,8 @@ STARTS: Final = (16, 512)
 """Minimum and maximum number of local searches in a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
-"""Target for the number of local searches times the number of interactions of the path program. This target keeps the
-time of a search similar for small and large programs."""
+"""Target for the number of local searches times the number of interactions of the path program. It keeps the duration
+of a search similar for small and large programs."""
 
 
 def check_method(name: str) -> None:
@@ -59,7 +59,7 @@ def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
 
 
 def check_fit(setup: Setup) -> None:
-    """Check that a study's method and options work on its engine, before any expensive call or output.
+    """Check that a study's method and options suit its engine, before any expensive call or output.
 
     Raises:
         InputError: The method does not exist, needs derivatives that the engine does not provide, or its options cannot
@@ -113,10 +113,10 @@ SEARCHES: Final = 64
 """Number of local searches for further minima if the method kept only its best minimum."""
 
 BASINS: Final = 24
-"""Maximum number of known minima that are used as starting points for a changed problem."""
+"""Maximum number of known minima used as starting points for a changed problem."""
 
 RELEVANT: Final = 20.0
-"""Maximum excess of the sum of squares at a relevant minimum over the sum at the lowest minimum, in noise variances.
+"""Maximum excess of the sum of squares at a relevant minimum over that at the lowest minimum, in noise variances.
 This excess corresponds to a likelihood ratio of e^-10."""
 
 
@@ -153,7 +153,7 @@ class Trail:
     Attributes:
         candidates: The candidates in physical units, each [d].
         rmse_db: RMSE of each candidate [dB].
-        best_db: RMSE of the best candidate up to each call [dB].
+        best_db: RMSE [dB] of the best candidate up to each call.
         iteration: Round of each call, counted from 1.
         seconds: Time from the start to each call [s].
         best: The best candidate [d].
@@ -161,11 +161,10 @@ class Trail:
         best_rmse_db: RMSE of the best candidate [dB].
         best_value: Objective of the best candidate, including priors [dB].
         minima: Minima of the optimizer's searches, best first, as points of the search space [k, d].
-        rt_calls: Number of RT calls of the search, including calls from an earlier run that are answered from the
-            ledger.
+        rt_calls: Number of RT calls of the search, including those answered from the ledger of an earlier run.
         ledger_hits: Number of calls that are answered from the ledger.
-        modelled: The engine's values for each candidate [L], only for an engine without derivatives.
-        observed: Further observables for each candidate [K, L], only for an engine without derivatives.
+        modelled: The engine's values [L] for each candidate; only for an engine without derivatives.
+        observed: Further observables [K, L] for each candidate; only for an engine without derivatives.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)
@@ -261,7 +260,7 @@ def _hits(engine: Engine) -> int:
 def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Collect the known minima of a problem; search for further minima if the method kept only its best minimum.
 
-    Returns points of the search space, with the calibrated point first [k, d], and their mean squares [k].
+    Returns points [k, d] of the search space, the calibrated point first, and their mean squared residuals [k].
     """
     points = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
     # The calibrated point and the optimizer's best point are the same minimum.

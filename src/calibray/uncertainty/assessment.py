@@ -45,20 +45,20 @@ from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterio
 from calibray.uncertainty.verdicts import Axes, JudgedSet, consistent, local_intervals, verdicts, with_reason
 
 LARGEST_ERROR: Final = 0.5
-"""Intervals are drawn only if the emulator's leave-one-out error is at most this fraction of the best call's RMSE. With
-larger errors, candidates near a call fit better only because the emulator is exact at the calls. Without this limit,
-the intervals of parameters judged identified or weakly identified contained 2 of 7 true values for runs with 2 calls
-per parameter. For runs with 8 or 16 calls per parameter, the intervals contained 14 of 14
+"""The posterior is drawn only if the emulator's leave-one-out error is at most this fraction of the best call's RMSE.
+With larger errors, candidates near a call would seem to fit better merely because the emulator is exact at the calls.
+Without this limit, the intervals of parameters judged identified or weakly identified contained 2 of 7 true values for
+runs with 2 calls per parameter. For runs with 8 or 16 calls per parameter, they contained 14 of 14
 (docs/measurements/intervals.md)."""
 
 NEGLIGIBLE_DB: Final = 0.05
 """An emulator error up to this value is always accepted [dB]; path loss is not measured more precisely."""
 
 DRAWS_PER_CALL: Final = 40
-"""Number of evaluations per calibration call that larger populations may use if small populations disagree. A
+"""Number of evaluations that larger populations may use per calibration call if small populations disagree. A
 call with derivatives takes as long as 10 to 16 of these evaluations. Populations of 64 members disagreed in 8 of 24
-runs in districts 100 to 106. With 256 members instead, the worst 90 % set contained 0.80 of the posterior instead of
-0.76, on average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
+runs in districts 100 to 106. With 256 members, the worst 90 % set contained 0.80 of the posterior instead of 0.76, on
+average over the 5 runs with a reference (`benchmarks/simulation_based.py --members 64 256`)."""
 
 EQUAL: Final = 0.1
 """If the drawn emulators differ from their mean by less than this fraction of the lowest objective, only the mean is
@@ -77,8 +77,8 @@ MAX_COLUMNS: Final = 100
 """Maximum number of nuisance columns for which the draws include the coefficients."""
 
 SHOWN_DIFFERENCE: Final = 0.1
-"""The credible set for the measured buildings is reported if it differs sufficiently from the set for all buildings.
-The sets must differ over more than this fraction of the range that they span together."""
+"""The credible set for the measured buildings is reported only if it and the set for all buildings differ over more
+than this fraction of the range that they span together."""
 
 CUSTOMARY: Final = {("relative_permittivity", "linear"): 10.0, ("conductivity", "log"): float(np.log(1000.0))}
 """Usual widths of parameter ranges: building materials have permittivities between 2 and 12, and conductivities that
@@ -88,11 +88,11 @@ EXACT_DB: Final = 1e-6
 """RMSE below which the data are treated as noise-free, and linear theory is treated as exact [dB]."""
 
 FEWEST_DRAWS: Final = 30
-"""Minimum number of effective draws for comparing standard deviations, whose uncertainty is then 13 %."""
+"""Minimum number of effective draws for comparing standard deviations, which are then uncertain by 13 %."""
 
 NOTABLE_SHARE: Final = 0.85
-"""Maximum remaining fraction of an interval's width that is reported. Larger fractions may be due to chance, because a
-standard deviation from few draws is uncertain."""
+"""Maximum remaining fraction of an interval's width that is reported. Larger fractions may be due to chance, because
+standard deviations from few draws are uncertain."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def _assess(
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
     freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
-        # Unless there are more residuals than unknowns, the residuals contain no information about the errors.
+        # The residuals contain no information about the errors unless there are more residuals than unknowns.
         reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": optimum.num_rows})
         return Certainty(Uncertainty(_full_ranges(problem.parameters, reason)))
     local = local_intervals(problem, trail, optimum)
@@ -255,7 +255,7 @@ def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None, ca
 
 
 def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> dict[str, float]:
-    """Posterior weight of each kind of noise, of differences between buildings, and of an undeclared offset."""
+    """Posterior weights of each kind of noise, of differences between buildings, and of an undeclared offset."""
     models, weight = model.marginal.models, posterior.means.weight
     weights = {kind: 0.0 for kind in dict.fromkeys(each.kind for each in models)}
     by_model = np.bincount(posterior.model, weight, len(models))
@@ -338,10 +338,10 @@ def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> d
 
 
 def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause, float]]:
-    """For each parameter of the study, the fraction of its interval's width that remains without each cause.
+    """For each parameter, the fraction of its interval's width that would remain without each cause of uncertainty.
 
-    Draws in which a cause is absent, such as draws with equal buildings, are draws from the posterior of a study that
-    excludes this cause. The effect of the constants that the scene fixes is removed by linear regression of the
+    Draws in which a cause is absent (for example, in which all buildings are equal) follow the posterior of a study
+    that excludes this cause. The effect of the constants that the scene fixes is removed by linear regression of the
     parameter on these constants. The remaining fraction is an upper bound, because the true dependence may be
     nonlinear. Only causes that noticeably widen an interval are listed, in ascending order of the fractions.
     """
@@ -360,7 +360,7 @@ def remaining_widths(model: JointModel, posterior: Posterior) -> list[dict[Cause
         without = np.where(mask, 0.0, draws.weight)
         if mask.any() and _effective(without) >= FEWEST_DRAWS:
             _note(shares, cause, _deviation(draws.point, without) / full)
-    # All coordinates that represent the same value, such as a scattering coefficient of 0, become one coordinate.
+    # Coordinates that represent the same value, such as a scattering coefficient of 0, become one coordinate.
     parameters = model.parameters
     constants = parameters.to_unit(parameters.from_unit(posterior.joint))[:, width:]
     if constants.shape[1] and _effective(draws.weight) >= FEWEST_DRAWS + constants.shape[1]:
@@ -388,11 +388,11 @@ def _effective(weight: NDArray[np.float64]) -> float:
 
 
 REPEAT_M: Final = 0.01
-"""Maximum distance between the link ends of two rows that count as repeats of one link [m]; antennas are larger than
-this distance."""
+"""Maximum distance [m] between the link ends of two rows that count as repeats of one link; antennas are larger than
+this."""
 
 REPEAT_DB: Final = 0.1
-"""Maximum difference in modelled path loss between two rows that repeat a link [dB]; a different antenna or carrier
+"""Maximum difference [dB] in modelled path loss between two rows that repeat a link; a different antenna or carrier
 frequency causes a larger change."""
 
 
@@ -400,9 +400,9 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
     """Replace the rows that repeat a link with their mean; the problem is unchanged if no row repeats a link.
 
     Rows at the same position share the link's error. If these rows were treated as independent, intervals would be too
-    narrow by the square root of the number of rows. The scatter of the rows contains no information about the shared
-    error. If the rows agree closely, a noise model with one variance for scatter and shared error would underestimate
-    the shared error.
+    narrow by a factor of the square root of the number of rows. The scatter of the rows contains no information about
+    the shared error. If the rows agree closely, a noise model with one variance for scatter and shared error would
+    underestimate the shared error.
 
     Rows repeat a link if they have the same end positions, nuisances and biases, and if their modelled path losses
     agree, both at the initial values and at the best candidate. The first row is assigned the mean path loss, the mean
@@ -454,9 +454,8 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
 def _means(
     values: NDArray[np.float64], counted: NDArray[np.int64], first: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Copy of the values [L] with the mean of a link's known values in its first row; NaN if no value is known.
-
-    For each of the m rows with nonzero weight, `first` is the index of the first row of the same link [m].
+    """Copy of the values [L] with the mean of a link's known values in its first row; NaN if no value is known. For
+    each of the m rows with nonzero weight, `first` [m] is the index of the first row of the same link.
     """
     known = np.isfinite(values[counted])
     number = np.bincount(first[known], minlength=len(counted))

@@ -1,4 +1,4 @@
-"""Replay in which further constants vary: constants of individual buildings, and constants fixed by the scene.
+"""Replay in which further constants vary: those of individual buildings, and those fixed by the scene.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each
 combination of a building and a material becomes a separate material.
@@ -38,9 +38,9 @@ MANY: Final = 10_000
 """Number of interactions above which weak paths are left out."""
 
 WEAK: Final = 0.1
-"""Maximum fraction of a link's power, summed over 16 candidates, that all omitted paths together may carry. On an
+"""Maximum fraction of a link's power, summed over 16 candidates, that the omitted paths together may carry. On an
 office floor in Auckland, 71 % of the interactions are left out, which changes the path loss of posterior draws by 0.05
-dB (RMS); the errors are 5.3 dB. With a fraction of 0.03, 61 % of the interactions are left out, and the change is 0.02
+dB (RMS); the errors are 5.3 dB. With a limit of 0.03, 61 % of the interactions are left out, and the change is 0.02
 dB."""
 
 EXPONENTS: Final = {exponent for _, exponent in LAWS.values()}
@@ -54,7 +54,7 @@ class _Part:
     Attributes:
         engine: The replay; each of its k parameters is a constant of one building or of all objects.
         links: Indices of its links.
-        constants: Indices of the part's constants among the constants of all carriers [k]; empty if the paths depend on
+        constants: Indices [k] of the part's constants among the constants of all carriers; empty if the paths depend on
             no constant.
     """
 
@@ -83,7 +83,7 @@ class Split(ABC):
         parameter_of: Index of the parameter to which each of c constants belongs, in ascending order [c].
         building_of: Index of each constant's building; -1 for other objects, such as the ground [c].
         met: Indices of the buildings with which the paths interact.
-        interactions: Number of interactions that are evaluated per candidate.
+        interactions: Number of interactions evaluated per candidate.
     """
 
     parameter_of: NDArray[np.int64]
@@ -135,7 +135,7 @@ class SplitReplay(Split):
 @final
 @dataclass(frozen=True, eq=False)
 class SplitChunks(Split):
-    """A split replay of links in chunks. Every worker splits the replays of its chunks and stores the results.
+    """A split replay of links in chunks. Every worker splits and stores the replays of its own chunks.
 
     Attributes:
         engine: The chunks.
@@ -155,7 +155,7 @@ class SplitChunks(Split):
 
 @dataclass(frozen=True)
 class _Splitting:
-    """Settings for splitting replays; the settings can be pickled. Equal settings split a replay in the same way.
+    """Settings for splitting replays, which can be pickled. Equal settings split a replay in the same way.
 
     Attributes:
         parameters: The study's parameters and further constants.
@@ -231,8 +231,8 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
     """Add further parameters to a problem's replay and, if `by_building`, separate constants for each building.
 
     `can_split` must be true for the problem. The study's parameters come first; each further parameter is a constant
-    with one value for all carriers. If the paths interact with fewer than two buildings, no separate constants are
-    added for buildings.
+    with one value for all carriers. If the paths interact with fewer than two buildings, buildings get no separate
+    constants.
     """
     engine = cast(Replay | ReplayCarriers | Chunked, problem.engine)
     # Weak paths often arrive late, and delay spreads depend on late paths, so further observables need all paths.
@@ -253,7 +253,7 @@ def _split_paths(
 ) -> tuple[Replay, list[tuple[int, int]]]:
     """The replay of one carrier with the given paths, and each constant's parameter and building (-1 for none).
 
-    If the paths depend on no constant, the replay is unchanged and the list is empty.
+    If the paths depend on no constant, the replay is unchanged, and the list is empty.
     """
     names = list(paths.materials)
     # One material per pair of building and material, in the order of the sorted pairs.
@@ -300,7 +300,8 @@ def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
 
 
 def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Parameter and building of each constant in a chunk [c, 2], buildings on its paths, and number of interactions."""
+    """Parameter and building [c, 2] of each constant in a chunk, the buildings on its paths, and its number of
+    interactions."""
     split = chunk.derived(splitting)
     return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
 

@@ -44,7 +44,7 @@ def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
 def systematic_resampling(
     weight: NDArray[np.float64], count: int, random: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Draw indices [count], in ascending order, with given weights [n], by systematic resampling."""
+    """Draw indices [count] with given weights [n] by systematic resampling; the indices are in ascending order."""
     total = np.cumsum(weight)
     quantile = (np.arange(count) + random.random()) / count * total[-1]
     return np.minimum(np.searchsorted(total, quantile), len(weight) - 1)

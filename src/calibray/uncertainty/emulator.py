@@ -38,7 +38,7 @@ FUNCTIONS: Final = 8
 """Number of functions drawn."""
 
 MAX_CALLS: Final = 200
-"""Maximum number of calls that the process interpolates; its covariance matrix is factored about a hundred times."""
+"""Maximum number of calls that the process interpolates; the covariance matrix is factored about a hundred times."""
 
 NEAR: Final = 0.005
 """If there are more than `MAX_CALLS` calls and two calls are closer together than this in the unit cube, only the
@@ -46,7 +46,7 @@ better call is used."""
 
 
 class MeanFunction(Protocol):
-    """The mean of the Gaussian process, which predicts path loss without calls."""
+    """The mean of the Gaussian process: the path loss predicted without calls."""
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
         """Path loss [k, m] at points of the unit cube [k, d], and the inputs of the process."""
@@ -55,13 +55,13 @@ class MeanFunction(Protocol):
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """Path loss, its derivatives [k, m, d], the inputs, and the derivatives of the inputs' responses [k, r, d]."""
+        """Path loss, its derivatives [k, m, d], the inputs, and the derivatives [k, r, d] of the inputs' responses."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class ConstantMean:
-    """A constant mean with linear responses, which is used if there is no replay.
+    """A constant mean with linear responses, used if there is no replay.
 
     Attributes:
         centre: Mean of each emulated row over the calls [m], [dB].
@@ -86,8 +86,8 @@ class ConstantMean:
 class ResponseRows:
     """The emulated rows, which replace the residuals: path loss of links with nonzero weight, then further observables.
 
-    Further observables are divided by their error and multiplied by the error of path loss, so that all rows are
-    comparable.
+    Further observables are divided by the standard deviation of their error and multiplied by that of path loss, so
+    that all rows are comparable.
 
     Attributes:
         problem: The problem.
@@ -138,7 +138,7 @@ class ResponseRows:
 
     @property
     def used(self) -> list[NDArray[np.int64]]:
-        """For each further observable, the indices of the links with a value."""
+        """Indices, for each further observable, of the links with a value."""
         return [each.used(self.problem.objective.weight) for each in self.problem.observed]
 
     def unit(self, index: int) -> float:
@@ -171,8 +171,7 @@ class EmulatedEngine:
         mean: The mean function.
         function: The function added to the mean.
         rows: The definition of the m emulated rows.
-        initial_loss: Path loss of all links at the initial values [L], [dB], which is returned for links that are not
-            emulated.
+        initial_loss: Path loss [L], [dB], of all links at the initial values; returned for links that are not emulated.
         calls: Number of candidates evaluated so far.
     """
 
@@ -319,7 +318,7 @@ def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) 
 
 
 def _calls(problem: Problem, trail: Trail, box: Box, rows: ResponseRows) -> Calls:
-    """The calls with path loss for every link with nonzero weight; if there are too many calls, a selection."""
+    """The calls with path loss for every link with nonzero weight; a selection of them if there are too many."""
     parameters = problem.parameters
     candidates, modelled = np.array(trail.candidates), np.array(trail.modelled)
     observed = np.array(trail.observed)
