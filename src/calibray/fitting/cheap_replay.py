@@ -99,8 +99,7 @@ class Rows(Protocol):
         slope: NDArray[np.float64],
         observed_slope: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
-        """Derivatives of the residuals [n, m, k], from the derivatives of path loss [n, L, k] and observables [n, K, L,
-        k]."""
+        """Derivatives [n, m, k] of the residuals, from those of path loss [n, L, k] and of observables [n, K, L, k]."""
         ...
 
     @property
@@ -193,8 +192,7 @@ class ReplayedModel:
     def _respond(
         self, candidates: NDArray[np.float64], log_gain: NDArray[np.float64], derivatives: bool
     ) -> Responses:
-        """Responses to candidates [n, d] with log gains [n, layers]; derivatives are also with respect to the log
-        gains."""
+        """Responses to candidates [n, d] with log gains [n, layers]; derivatives include those for the log gains."""
         if self.rows.wanted:
             return cast(Observing, self.engine).respond(candidates, self.rows.wanted, derivatives)
         none = np.zeros((len(candidates), 0, len(self._reached)))

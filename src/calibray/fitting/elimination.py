@@ -110,9 +110,11 @@ class Elimination:
         )
 
     def coefficients(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best coefficients [n, q], in dB per unit of the column. `gap` [n, m] is measured minus modelled path loss
-        [dB] at the links with nonzero weight. An undetermined coefficient takes the value nearest to 0 within its
-        bounds, unless this value would keep other coefficients from reaching the minimum within their bounds.
+        """The best coefficients [n, q], in dB per unit of the column.
+
+        `gap` [n, m] is measured minus modelled path loss [dB] at the links with nonzero weight. An undetermined
+        coefficient takes the value nearest to 0 within its bounds, unless this value would keep other coefficients from
+        reaching the minimum within their bounds.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -137,8 +139,7 @@ class Elimination:
     def projection(
         self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for coefficients at a
-        bound.
+        """Coefficients [n, q, d] of a least-squares fit of the design to the derivatives; 0 for those at a bound.
 
         They equal minus the derivatives of the best coefficients [n, q] with respect to the parameters.
         `slope` [n, m, d] contains the derivatives of the modelled path loss at the links with nonzero weight.
@@ -160,8 +161,7 @@ class Elimination:
         return projection
 
     def remove(self, slope: NDArray[np.float64], projection: NDArray[np.float64]) -> None:
-        """Subtract the projection [n, q, d] in place from the derivatives [n, m, d] at the links with nonzero
-        weight."""
+        """Subtract, in place, the projection [n, q, d] from derivatives [n, m, d] at links with nonzero weight."""
         if isinstance(self.design, np.ndarray):
             slope -= self.design @ projection
             return
@@ -219,8 +219,7 @@ class Arrowhead:
         return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unconstrained minima [m, q, k] over the free components for right-hand sides [m, q, k]; fixed components are
-        zero.
+        """Unconstrained minima [m, q, k] for right-hand sides [m, q, k] over the free components; the others are zero.
 
         `free` [m, q] is the mask of the free components.
         """
@@ -294,8 +293,7 @@ class Arrowhead:
     def _restricted(
         self, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Blocks, border and corner, with the rows and columns of fixed components replaced by those of the identity
-        matrix."""
+        """Blocks, border and corner, with rows and columns of fixed components taken from the identity matrix."""
         groups, width, edge = self.border.shape
         inner, outer = free[:, : groups * width].reshape(-1, groups, width), free[:, groups * width :]
         return (

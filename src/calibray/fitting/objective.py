@@ -269,9 +269,10 @@ class Objective:
         return shares
 
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Squares and products of the residuals and their derivatives, from sums over all links. The results are the
-        products [n, k, k] of the k columns (the derivatives and minus the residuals), including the rows of priors, and
-        the sum of squares [n], [dB^2], over only the links.
+        """Squares and products of the residuals and their derivatives, from sums over all links.
+
+        The results are the products [n, k, k] of the k columns (the derivatives and minus the residuals), including the
+        rows of priors, and the sum of squares [n], [dB^2], over only the links.
 
         Raises:
             EngineError: No minimum of the nuisance within its bounds was found.

@@ -70,8 +70,7 @@ class Observed:
     def residuals(
         self, modelled: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Modelled minus measured values [n, m], in the study's unit and with the bias removed, and the biases [n,
-        groups].
+        """Modelled minus measured values [n, m], in the study's unit, without the biases; and the biases [n, groups].
 
         Modelled values [n, L] are in SI units; the links have weights [L].
         """
@@ -87,8 +86,9 @@ class Observed:
         return np.where(found, gap - bias[:, self.group[used]], 0.0), -bias
 
     def slopes(self, derivative: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives [n, m, k] of the residuals, from derivatives [n, L, k] of the modelled values. The latter are NaN
-        for a link without a modelled value.
+        """Derivatives [n, m, k] of the residuals, from derivatives [n, L, k] of the modelled values.
+
+        The latter are NaN for a link without a modelled value.
         """
         used = self.used(weight)
         slope = np.moveaxis(derivative[:, used] / self.scale, 2, 1)

@@ -115,8 +115,7 @@ def _far_from(
     objective: Objective,
     weight: NDArray[np.float64],
 ) -> Objective:
-    """The objective with a weight of 0 for each link whose predicted path loss exceeds its entry in `largest_db`
-    [L]."""
+    """The objective with a weight of 0 for links whose predicted path loss exceeds `largest_db` [L]."""
     return objective.reweighted(np.where(predicted_db <= largest_db, weight, 0.0))
 
 

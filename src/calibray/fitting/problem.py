@@ -269,8 +269,7 @@ class Problem:
 
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
-        """The engine that returns sums over its chunks, and the objective's share for each chunk; None without
-        chunks."""
+        """The engine that returns sums over chunks, and the objective's share for each chunk; None without chunks."""
         if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)

@@ -128,8 +128,9 @@ def understand(
 
 
 def half_spaces(fit: Understanding, calls: list[Call]) -> tuple[str, ...]:
-    """Materials whose assumed thickness the ratios do not determine, as for a half-space. If the slab of such a
-    material is replaced by a half-space, the misfit increases by at most `EXACT_DB`.
+    """Materials whose assumed thickness the ratios do not determine, as for a half-space.
+
+    If the slab of such a material is replaced by a half-space, the misfit increases by at most `EXACT_DB`.
     """
     last, ratios = calls[-1], ratios_of(calls)
     if not ratios:
@@ -218,8 +219,7 @@ def _perturbed(fit: Understanding, last: Call, random: np.random.Generator) -> U
 
 
 def _with_the_constants_of(fit: Understanding, ratios: list[Ratio], last: Call) -> list[Understanding]:
-    """Explanations with the same constants and with upright antennas of the best polarizations; none for known
-    antennas.
+    """Explanations with the same constants and the best upright antennas; none if the antennas are known.
 
     Many engines differ from the study only in their antennas.
     """
@@ -363,9 +363,10 @@ def _tables(model: RayModel, ratios: list[Ratio], last: Call) -> NDArray[np.floa
 def _errors(
     fit: Understanding, ratios: list[Ratio], tables: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted errors [m], [dB], of the ratios, and their derivatives [m, k] with respect to the values. If a path has
-    power in the engine but not in the model, no correction can restore this power. Its error is then `LEAST_DB` minus
-    the power in the engine.
+    """Weighted errors [m], [dB], of the ratios, and their derivatives [m, k] with respect to the values.
+
+    If a path has power in the engine but not in the model, no correction can restore this power. Its error is then
+    `LEAST_DB` minus the power in the engine.
 
     `tables` contains the constants of the last call and of each ratio's call; see `_tables`.
     """

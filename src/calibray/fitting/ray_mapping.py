@@ -314,9 +314,10 @@ def _most_informative(problem: Problem, call: Call, random: np.random.Generator)
 
 
 def _changes(calls: list[Call]) -> tuple[int, float, int]:
-    """Largest number of paths that occur in the last call but not in another call, or vice versa, and their effect. The
-    second result is the largest change in path loss [dB] if these paths are left out. The third result is the largest
-    number of links that lose all their paths.
+    """Largest number of paths that occur in the last call but not in another call, or vice versa, and their effect.
+
+    The second result is the largest change in path loss [dB] if these paths are left out. The third result is the
+    largest number of links that lose all their paths.
     """
     last, changed, change_db, lost = calls[-1].export, 0, 0.0, 0
     for call in calls[:-1]:

@@ -454,8 +454,9 @@ def average_repeats(problem: Problem, best: NDArray[np.float64]) -> Problem:
 def _means(
     values: NDArray[np.float64], counted: NDArray[np.int64], first: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Copy of the values [L] with the mean of a link's known values in its first row; NaN if no value is known. For
-    each of the m rows with nonzero weight, `first` [m] is the index of the first row of the same link.
+    """Copy of the values [L] with the mean of a link's known values in its first row; NaN if no value is known.
+
+    For each of the m rows with nonzero weight, `first` [m] is the index of the first row of the same link.
     """
     known = np.isfinite(values[counted])
     number = np.bincount(first[known], minlength=len(counted))

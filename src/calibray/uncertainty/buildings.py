@@ -300,8 +300,7 @@ def _chunk_materials(chunk: Chunk) -> list[dict[str, Material]]:
 
 
 def _split_chunk(chunk: Chunk, splitting: _Splitting) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Parameter and building [c, 2] of each constant in a chunk, the buildings on its paths, and its number of
-    interactions."""
+    """Parameter and building [c, 2] of each constant in a chunk, buildings on its paths, and interaction count."""
     split = chunk.derived(splitting)
     return np.stack([split.parameter_of, split.building_of], axis=1), split.met, split.interactions
 
