@@ -1,11 +1,11 @@
-"""Fields along stored paths for any materials, in pure JAX: batched over candidates and differentiable.
+"""Fields along stored paths for any materials, in pure JAX; batched over candidates, and differentiable.
 
 The gain of a path is a = (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx, with the spreading factor A, the antenna fields E
 and one Jones matrix J for each interaction.
 
-Path programs are evaluated in double precision by default, and in single precision on request. While they run, the
-functions of this package use their own JAX settings (`calibray.fields.jax_settings`). Importing the package does not
-change JAX's settings.
+Path programs are evaluated in double precision by default, and in single precision on request. The functions of this
+package run under their own JAX settings (`calibray.fields.jax_settings`). Importing the package does not change JAX's
+settings.
 """
 
 from calibray.fields.coefficient_tables import FINEST as FINEST

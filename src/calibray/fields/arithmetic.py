@@ -5,7 +5,7 @@ functions of pairs work element by element and are differentiable.
 
 A segment is either the paths of one link or the interactions of one link with one material. XLA scatters and adds one
 number at a time, which takes about 5 ns per number. Most numbers are therefore added in blocks. The numbers are ordered
-so that each block belongs to one segment, and only the remainder of each segment is scattered.
+so that each block belongs to one segment. Only the remainder of each segment is scattered.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from numpy.typing import NDArray
 
 Pair = tuple[jax.Array, jax.Array]
-"""A complex number as its real and imaginary parts."""
+"""A complex number, given as its real and imaginary parts."""
 
 Values = TypeVar("Values")
 
@@ -76,7 +76,7 @@ def safe_sqrt(value: jax.Array) -> jax.Array:
 
 
 def materialize(values: Values, positive: jax.Array) -> Values:
-    """Return the values, computed once and stored; `positive` is any positive number that is unknown at compile time.
+    """Compute and store the values once; `positive` is any positive number that is unknown at compile time.
 
     On the CPU, XLA fuses a computation into each of its uses, so it repeats sines and exponentials many times. XLA also
     removes `optimization_barrier`. XLA cannot fuse across a branch on a value that is unknown at compile time.
@@ -90,7 +90,7 @@ def materialize(values: Values, positive: jax.Array) -> Values:
 def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Cosine and sine of angles [...], [rad].
 
-    In double precision, XLA on the CPU calls the system's mathematical functions for one number at a time, which takes
+    In double precision, XLA on the CPU calls the system's mathematical functions for one number at a time. This takes
     about 30 ns for a cosine and a sine. Polynomials without branches are vectorized and take 2 ns. Each result is
     within 2.3e-16 of the true value. Beyond a million turns, the rounding error of the angle itself dominates.
     """
@@ -137,8 +137,8 @@ class Segments:
     """The segments of an array of numbers.
 
     Attributes:
-        order: Order in which the numbers are added, whole blocks first [n]; None if the order is unchanged.
-        segment: Index of the segment of every block, then of every remaining number [blocks + n - BLOCK x blocks].
+        order: Order [n] in which the numbers are added, whole blocks first; None if the order is unchanged.
+        segment: Index [blocks + n - BLOCK x blocks] of the segment of every block, then of every remaining number.
         blocks: Number of whole blocks.
         count: Number of segments.
     """
@@ -167,7 +167,7 @@ def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
 
 
 def segment_sums(segments: Segments, values: jax.Array) -> jax.Array:
-    """Sum of the numbers [n] in each segment [count]; 0 for a segment without numbers."""
+    """Sums [count] of the numbers [n] in each segment; 0 for a segment without numbers."""
     if segments.order is not None:
         end = segments.blocks * BLOCK
         blocks = values.at[segments.order[:end]].get(mode="promise_in_bounds").reshape(-1, BLOCK).sum(axis=1)

@@ -1,6 +1,6 @@
 """Delays, angles and power delay profiles of links, for any materials.
 
-These quantities are computed from the powers of a link's paths, so they depend on the materials as smoothly as path
+These quantities are computed from the powers of a link's paths, so they depend as smoothly on the materials as path
 loss does. `statistics` and `delay_profile` are pure JAX. Together with `calibray.fields.path_powers`, they can be
 differentiated with respect to the materials within `calibray.fields.jax_settings`.
 """
@@ -33,7 +33,7 @@ class ChannelStatistics:
     Attributes:
         mean_delay: Mean delay [L], [s].
         delay_spread: Root mean square delay spread [L], [s].
-        k_factor_db: Ratio of the strongest path's power to the total power of all other paths [L], [dB]; +inf for a
+        k_factor_db: Ratio [L], [dB], of the strongest path's power to the total power of all other paths; +inf for a
             single path.
         departure_spread: Azimuth spread at departure [L], [rad].
         arrival_spread: Azimuth spread at arrival [L], [rad].
@@ -75,7 +75,7 @@ def _statistics(
 def statistics(
     program: GroupedProgram, power: jax.Array, departure: jax.Array, arrival: jax.Array
 ) -> ChannelStatistics:
-    """Statistics of every link from the powers of its paths [P] and their azimuths [P], [rad]."""
+    """Statistics of every link, from the powers [P] and azimuths [P], [rad], of its paths."""
     link, delay = program.phases
     of_links = partial(link_mean, power, link=link, num_links=program.num_links)
     return ChannelStatistics(
@@ -88,14 +88,14 @@ def statistics(
 
 
 def link_mean(weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Weighted mean of each link's values [L]; NaN if all weights are 0."""
+    """Weighted mean [L] of each link's values; NaN if all weights are 0."""
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
     sums = total(weight)
     return jnp.where(sums > 0, total(weight * value) / jnp.where(sums > 0, sums, 1.0), jnp.nan)
 
 
 def delay_spread(power: jax.Array, delay: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Root mean square delay spread of every link [L], [s] (ITU-R P.1407-8 eq. 3); NaN without power."""
+    """Root mean square delay spread [L], [s], of every link (ITU-R P.1407-8 eq. 3); NaN without power."""
     mean = link_mean(power, delay, link, num_links)
     # Using delays relative to the mean avoids cancellation between the mean square and the squared mean.
     excess_delay = delay - jnp.nan_to_num(mean)[link]
@@ -104,7 +104,7 @@ def delay_spread(power: jax.Array, delay: jax.Array, link: jax.Array, num_links:
 
 
 def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Circular angular spread of every link [L], [rad] (3GPP TR 38.901 annex A.1); NaN without power."""
+    """Circular angular spread [L], [rad], of every link (3GPP TR 38.901 annex A.1); NaN without power."""
     # sqrt(-2 ln |sum P e^{j phi} / sum P|)
     cosine, sine = (link_mean(power, part(angle), link, num_links) for part in (jnp.cos, jnp.sin))
     resultant = jnp.hypot(cosine, sine)
@@ -114,7 +114,7 @@ def angular_spread(power: jax.Array, angle: jax.Array, link: jax.Array, num_link
 
 
 def k_factor_db(power: jax.Array, link: jax.Array, num_links: int) -> jax.Array:
-    """Ratio of the strongest path's power to the power of all other paths [L], [dB]; NaN for links without power."""
+    """Ratio [L], [dB], of the strongest path's power to the power of all other paths; NaN for links without power."""
     total = jax.ops.segment_sum(power, link, num_links)
     strongest = jax.ops.segment_max(power, link, num_links)
     rest = total - strongest
@@ -150,7 +150,7 @@ def power_delay_profile(
 
 
 def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -> jax.Array:
-    """Power gain of every link in each delay bin [L, n], from path powers [P] and increasing bin edges [n + 1], [s]."""
+    """Power gain [L, n] of every link in each delay bin, from path powers [P] and increasing bin edges [n + 1], [s]."""
     link, delay = program.phases
     num_bins = edges.shape[0] - 1
     index = jnp.searchsorted(edges, delay, side="right") - 1

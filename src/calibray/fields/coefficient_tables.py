@@ -6,10 +6,10 @@ through four nodes then takes about 10 ns per interaction, instead of 100 ns for
 interaction in its table does not depend on the materials, so it is computed once. Each pair of material and mode has a
 separate row of nodes.
 
-Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle is
-very close to grazing incidence. A sheet of plasterboard at 2 GHz requires about a hundred intervals, and a thick slab
+Nodes are evenly spaced in a root of the cosine: the square root or, for metals, whose Brewster angle is very close to
+grazing incidence, the sixth root. A sheet of plasterboard at 2 GHz requires about a hundred intervals, and a thick slab
 at 60 GHz requires thousands. `table_intervals` chooses the number of intervals from a few representative candidates.
-`table_error` then bounds every candidate's error, even at Brewster angles, grazing incidence and slab resonances.
+`table_error` then bounds the error for every candidate, even at Brewster angles, grazing incidence and slab resonances.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _GRAZING: Final = 1e-9
 """Smallest cosine at a node. At exactly 0, even air would be a perfect reflector."""
 
 _EXTRA_NODES: Final = 3
-"""Number by which the nodes of a row exceed its intervals: one node before the first interval, one at the end of the
-last interval, and one after the last interval."""
+"""Difference between the numbers of nodes and intervals in a row: there is one more node before the first interval, one
+at the end of the last interval, and one after it."""
 
 _STENCIL: Final = 3
 """Number of nodes that `table_error` requires on each side of a node."""
@@ -69,11 +69,12 @@ class TableLayout:
         cell: Index of the node below the coefficient, counted over all rows; one array for each step of each group, [n]
             or [k, n].
         fraction: Distance of the coefficient from the node below, in units of the interval; arrays of the same shapes.
-        cosine: Cosine of incidence at every node [N].
+        cosine: Cosine of the angle of incidence at every node [N].
         material: Material of every node [N].
         mode: Mode of every node [N].
-        rank: Index of every node in its row, 0 for the node before grazing incidence [N].
-        inner: Whether a node has at least three other nodes of its row, or their mirror images, on each side [N].
+        rank: Index [N] of every node in its row; 0 for the node before grazing incidence.
+        inner: Whether a node has at least three other nodes of its row, or their mirror images, on each side; shape
+            [N].
     """
 
     cell: tuple[jax.Array, ...]
@@ -91,9 +92,9 @@ class CoefficientTables:
     """Tables of coefficients. The numbers of a cell are adjacent in memory, so a look-up reads one or two cache lines.
 
     Attributes:
-        values: Coefficients of cubic polynomials in the fraction, from every node to the next [N + 4, 16]. Powers are
-            in ascending order, each with the real and imaginary parts of the transverse electric coefficient, then
-            those of the transverse magnetic coefficient. At the last four nodes, both coefficients are 1.
+        values: Coefficients [N + 4, 16] of cubic polynomials in the fraction, from every node to the next. Powers are
+            in ascending order. For each power, the real and imaginary parts of the transverse electric coefficient come
+            first, then those of the transverse magnetic coefficient. At the last four nodes, both coefficients are 1.
     """
 
     values: jax.Array
@@ -117,7 +118,7 @@ def coefficient_arguments(paths: Paths) -> Arguments:
 
 
 def spacing_roots(table: NDArray[np.float64], wavelength: float) -> NDArray[np.int64]:
-    """Degree of the root of the cosine in which a material's nodes are evenly spaced: 6 for metals, otherwise 2 [M]."""
+    """Degree [M] of the root of the cosine in which a material's nodes are evenly spaced: 6 for metals, otherwise 2."""
     loss = loss_term(jnp.asarray(table[:, FIELD_COLUMN["conductivity"]]), jnp.asarray(wavelength))
     return np.where(np.asarray(loss) > _METAL_LOSS, 6, 2)
 
@@ -181,7 +182,7 @@ def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) ->
 def _cubics(value: jax.Array) -> jax.Array:
     """Coefficients [N, 16] of the cubics from each node to the next: Lagrange interpolation through four nodes.
 
-    Cubics at nodes that lack a neighbour are meaningless and are not used.
+    Cubics at nodes that lack a neighbour are meaningless and unused.
     """
     before, after, beyond = (jnp.roll(value, -step, axis=0) for step in (-1, 1, 2))
     linear = after - before / 3 - value / 2 - beyond / 6
@@ -193,8 +194,8 @@ def _cubics(value: jax.Array) -> jax.Array:
 def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array) -> tuple[Pair, Pair]:
     """Transverse electric and magnetic coefficients (real, imaginary) [...], interpolated from the tables.
 
-    `cell` is the index of the node below, counted over all rows [...], and `fraction` is the distance from this node in
-    units of the interval [...].
+    `cell` [...] is the index of the node below, counted over all rows, and `fraction` [...] is the distance from this
+    node in units of the interval.
     """
 
     def value(part: int) -> jax.Array:
@@ -205,7 +206,7 @@ def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array)
 
 
 def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: int) -> jax.Array:
-    """Upper bound of the interpolation error of any real or imaginary part, by material and mode [M, 3].
+    """Upper bound [M, 3], by material and mode, of the interpolation error in any real or imaginary part.
 
     The value at every inner node is compared with the cubic through the nodes one and three steps away, which has twice
     the step. The error of a cubic scales with the fourth power of the step, so the tables' error is about a sixteenth
@@ -227,7 +228,7 @@ def table_error(tables: CoefficientTables, layout: TableLayout, num_materials: i
 
 @jax_settings()
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
-    """Number of intervals by material and mode [M, 3] that limits the error of coefficients to `tolerance` [1].
+    """Number of intervals [M, 3], by material and mode, that limits the coefficients' error to `tolerance` [1].
 
     Each number is a power of two up to `FINEST`, or 0 if no coefficient has this material and mode. `tables` [n, M, 8]
     contains the constants of representative candidates.
@@ -261,7 +262,7 @@ def _row_intervals(
 def _errors_by_intervals(
     table: jax.Array, mode: jax.Array, root: jax.Array, wavelength: jax.Array, finest: int
 ) -> jax.Array:
-    """Largest error of a row for each number of intervals, which doubles from `COARSEST` to `finest`."""
+    """Largest error of a row for each number of intervals; the numbers double from `COARSEST` to `finest`."""
     cosine = jnp.maximum((jnp.arange(2 * finest + 1) / (2 * finest)) ** root, _GRAZING)
     material = jnp.zeros(cosine.shape, dtype=jnp.int32)
     te, tm = coefficients_of_materials(

@@ -68,6 +68,6 @@ def _cotangent_times_transition(
 
 
 def _matrix(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix that rotates a Jones vector's frame [2, 2, n], from (cos, sin)."""
+    """Matrix [2, 2, n] that rotates a Jones vector's frame, from (cos, sin)."""
     cos, sin = rotation.T
     return np.array([[cos, sin], [-sin, cos]])

@@ -1,4 +1,4 @@
-"""Effects that are not material properties and that change the antenna fields of a program's paths.
+"""Effects other than material properties, which change the antenna fields of a program's paths.
 
 An effect has its own parameters. All quantities that depend on the fields (path loss, delay spread, derivatives with
 respect to the materials) are evaluated on the changed program.
@@ -26,7 +26,7 @@ class Effect(Protocol):
         ...
 
     def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
-        """The program with its antenna fields changed according to the values of all effect parameters [e]."""
+        """The program, with its antenna fields changed according to the values [e] of all effect parameters."""
         ...
 
 
@@ -41,7 +41,7 @@ class EffectBatch(NamedTuple):
 
 
 def apply_effects(program: GroupedProgram, effects: Effects, values: jax.Array) -> GroupedProgram:
-    """The program with all effects applied, for the values of their parameters [e]."""
+    """The program with all effects applied, for the values [e] of their parameters."""
     return reduce(lambda changed, effect: effect.apply(changed, values), effects, program)
 
 
@@ -66,10 +66,10 @@ class ExtraLoss:
     """Loss on paths through regions such as woodland; the loss saturates with the path length inside the regions.
 
     Attributes:
-        length: Length of every path inside the regions, times the ratio of the specific attenuation at the paths'
-            carrier to that at the study's carrier [P], [m].
+        length: Length [P], [m], of every path inside the regions, times the ratio of the specific attenuation at the
+            path's carrier to that at the study's carrier.
         maximum_db: Limit that the loss approaches for long paths in the regions [dB].
-        index: Index of the parameter that is the specific attenuation [dB/m]; None if the attenuation is fixed.
+        index: Index of the parameter for the specific attenuation [dB/m]; None if the attenuation is fixed.
         fixed: Specific attenuation [dB/m], if it is fixed.
     """
 
@@ -99,9 +99,9 @@ class RoughSurfaces:
     Attributes:
         exponent: 8 (pi / lambda)^2 times the sum of cos^2 theta over the specular reflections of each path on each
             material [P, M], [1/mm^2].
-        fixed: Standard deviation of the surface height of each material [M], [mm], if it is fixed.
-        index: For each material, the index of the parameter that is the standard deviation; None if the deviation is
-            fixed.
+        fixed: Standard deviation [M], [mm], of each material's surface height, if it is fixed.
+        index: For each material, the index of the parameter for the standard deviation; None if the standard deviation
+            is fixed.
     """
 
     exponent: jax.Array | NDArray[np.float64]
@@ -134,12 +134,12 @@ class DisplacementLoss:
     Attributes:
         link: Link of every path [P].
         group: Group of every link [K, L].
-        weights: Displacement of every group per unit of each effect parameter; one array [G, e] for each axis, [m].
+        weights: Displacement [m] of every group per unit of each effect parameter; one array [G, e] for each axis.
         origin: Values of the effect parameters at which the paths were traced [e].
-        knots: Displacements at which every link was traced, ascending [K, N, L], [m]; beyond the outer knots, the
-            change is constant.
-        coefficients: Coefficients of the cubics in the distance from the lower knot, highest power first
-            [K, 4, N - 1, L].
+        knots: Displacements [K, N, L], [m], at which every link was traced, in ascending order; beyond the outer knots,
+            the change is constant.
+        coefficients: Coefficients [K, 4, N - 1, L] of the cubics in the distance from the lower knot, highest power
+            first.
     """
 
     link: jax.Array | NDArray[np.integer]
@@ -155,12 +155,12 @@ class DisplacementLoss:
 
     @property
     def error_db(self) -> NDArray[np.float64]:
-        """Interpolation error between the five middle knots, for all axes [L], [dB]; 0 for fewer than seven knots.
+        """Interpolation error [L], [dB], between the five middle knots, for all axes; 0 for fewer than seven knots.
 
         At each of the three inner knots, the change is compared with the straight line between the two neighbouring
-        knots. The RMS differences of the axes add in quadrature. For a step of J dB next to the middle knot, the result
-        is J / sqrt(6), the RMS error of linear interpolation across a step at any position. For a step in an outer
-        interval, the result is J / sqrt(12).
+        knots. The RMS differences for the axes are added in quadrature. For a step of J dB next to the middle knot, the
+        result is J / sqrt(6), the RMS error of linear interpolation across a step at any position. For a step in an
+        outer interval, the result is J / sqrt(12).
         """
         middle = self.coefficients.shape[2] // 2
         if middle < 3:
@@ -178,7 +178,7 @@ class DisplacementLoss:
             knots = jnp.asarray(self.knots[axis])
             stated = (jnp.asarray(weights) @ (values - self.origin))[group]
             displacement = jnp.clip(stated, knots[0], knots[-1])
-            # Index of the lower knot: the number of inner knots that do not exceed the displacement.
+            # Index of the lower knot: the number of inner knots not exceeding the displacement.
             below = (displacement >= knots[1:-1]).sum(axis=0)[None]
             distance = displacement - jnp.take_along_axis(knots, below, axis=0)[0]
             cubic = jnp.take_along_axis(jnp.asarray(self.coefficients[axis]), below[None], axis=1)[:, 0]
@@ -187,7 +187,7 @@ class DisplacementLoss:
 
 
 def scaled(program: GroupedProgram, amplitude: jax.Array) -> GroupedProgram:
-    """Multiply the field of each path by its amplitude [P], in the program's order of paths."""
+    """Multiply the field of each path by its amplitude; the amplitudes [P] are in the program's order of paths."""
     groups, first = [], 0
     for group in program.groups:
         own = amplitude[first : first + group.size].astype(group.rx.dtype)

@@ -1,9 +1,9 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
-With the slab formula, one compiled loop evaluates the candidates of a batch one by one. The data of one candidate
-therefore stay in the core's L1 cache, and a smaller batch takes proportionally less time. Within the loop, the stages
-are materialized (`calibray.fields.arithmetic.materialize`). Otherwise, XLA on the CPU would fuse each stage into all of
-its uses and repeat it there.
+With the slab formula, one compiled loop evaluates the candidates of a batch one by one. One candidate's data therefore
+stay in the core's L1 cache, and a smaller batch takes proportionally less time. Within the loop, the stages are
+materialized (`calibray.fields.arithmetic.materialize`). Otherwise, XLA on the CPU would fuse each stage into all of its
+uses and repeat it there.
 
 Large programs with tables are evaluated in stages that are compiled separately. One stage interpolates the
 coefficients, propagates the fields and computes the power. This stage therefore reads every constant once and writes
@@ -49,7 +49,8 @@ from calibray.materials import Material
 from calibray.paths import Paths
 
 WITHOUT_TABLES: Final = np.zeros((1, 1, 3))
-"""Interpolation errors of coefficients without tables: all 0. The array broadcasts over candidates and materials."""
+"""Interpolation errors of coefficients without tables; all are 0. The array broadcasts over candidates and
+materials."""
 
 
 @jax_settings()
@@ -112,7 +113,7 @@ def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Comb
 
 @jax_settings()
 def program_gains(program: GroupedProgram, table: jax.Array) -> Pair:
-    """Gains of all paths in the program's order, real and imaginary parts [R, T, P], as a pure function.
+    """Gains [R, T, P] of all paths in the program's order, as real and imaginary parts; a pure function.
 
     `table` contains the material constants [M, 8].
     """
@@ -138,8 +139,8 @@ def path_losses(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
-    Path loss is +inf for a link without a path. The second result is the largest error of a tabulated coefficient by
-    candidate, material and mode [count, M, 3]. Without tables, this error is 0. Only the first `count` candidates are
+    Path loss is +inf for a link without a path. The second result is the largest error [count, M, 3] of a tabulated
+    coefficient, by candidate, material and mode. Without tables, this error is 0. Only the first `count` candidates are
     evaluated. The function is compiled for batches of n candidates, so a partly filled batch needs no new compilation.
     """
     count = len(tables) if count is None else count
@@ -171,8 +172,8 @@ def path_losses_and_slopes(
     """Path loss as in `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
     The derivatives are with respect to the material constants in `columns` of the tables. All derivatives are 0 for a
-    link without a path. The third result is the largest error of a tabulated coefficient by candidate, material and
-    mode [count, M, 3]. Without tables, this error is 0.
+    link without a path. The third result is the largest error [count, M, 3] of a tabulated coefficient, by candidate,
+    material and mode. Without tables, this error is 0.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -220,7 +221,7 @@ def path_losses_and_slopes_with_effects(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Path loss with effects, and its derivatives.
 
-    The derivatives are with respect to constants [count, L, M, columns] and effect parameters [count, L, e].
+    The derivatives are with respect to constants, [count, L, M, columns], and to effect parameters, [count, L, e].
     """
     count = len(tables) if count is None else count
     answers = _slopes_with_effects(program, tables, effects, count, columns, combining)
@@ -231,7 +232,7 @@ def path_losses_and_slopes_with_effects(
 def _power(
     program: GroupedProgram, responses: tuple[GroupResponse, ...], combining: Combining, keep: bool = False
 ) -> jax.Array:
-    """Power gain of every link [L]; with `keep`, the field after every interaction is stored for a reverse pass."""
+    """Power gain [L] of every link; with `keep`, the field after every interaction is stored for a reverse pass."""
     stored = partial(materialize, positive=program.wavelength)
     gain = path_fields(program, responses, stored if keep else lambda field: field)
     if combining.kind == "power":
@@ -259,7 +260,7 @@ def contract(
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of a quantity of every link with respect to material constants [L, M, columns].
+    """Derivatives [L, M, columns] of a quantity of every link with respect to material constants.
 
     Every interaction belongs to one material, so one tangent per column yields the derivatives for all materials. The
     computing time therefore does not grow with the number of materials. `slope` contains the derivatives of the
@@ -291,17 +292,17 @@ def _contract(
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of path loss [L, M, columns], from the derivatives of the power with respect to the response."""
+    """Derivatives [L, M, columns] of path loss, from the derivatives of the power with respect to the response."""
     return _loss_slope(power)[:, None, None] * contract(program, slope, derivatives, num_materials)
 
 
 def _loss_slope(power: jax.Array) -> jax.Array:
-    """Derivative of path loss [dB] with respect to the power of a link [L]; 0 for a link without a path."""
+    """Derivative [L] of each link's path loss [dB] with respect to its power; 0 for a link without a path."""
     return -10 / np.log(10) * jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
 
 
 def _by_path(by_field: list[AntennaFields], tangents: list[AntennaFields], blank: jax.Array) -> jax.Array:
-    """Derivatives of the power of every path with respect to effect parameters [P, e], through the antenna fields.
+    """Derivatives [P, e] of the power of every path with respect to effect parameters, through the antenna fields.
 
     `blank` is the empty result [0, e] of a program without paths.
     """

@@ -19,7 +19,7 @@ COEFFICIENT: Final = "c"
 """A reflection or a transmission."""
 
 RUN: Final = "r"
-"""Several reflections or transmissions in succession."""
+"""A run: several reflections or transmissions in succession."""
 
 SCATTERING: Final = "s"
 """A diffuse reflection."""
@@ -57,7 +57,7 @@ def exact_groups(paths: Paths) -> list[PathGroup]:
 
 
 def padded_groups(paths: Paths) -> list[PathGroup]:
-    """Group paths whose sequences are equal if each run of reflections and transmissions counts as one interaction.
+    """Group paths whose sequences are equal when each run of reflections and transmissions counts as one interaction.
 
     Within a group, the path with the most reflections and transmissions comes first. Each run is padded to the length
     of the longest corresponding run in the group.
@@ -100,14 +100,14 @@ def padded_groups(paths: Paths) -> list[PathGroup]:
 
 
 def _numbers(paths: Paths) -> NDArray[np.int64]:
-    """Index in `_LETTERS` of every interaction's letter [I]."""
+    """Index [I] of every interaction's letter in `_LETTERS`."""
     return np.select(
         [paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], _COEFFICIENT_NUMBER
     ).astype(np.int64)
 
 
 def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Code of each path [P]; paths with the same sequence of nonzero numbers have the same code."""
+    """Code [P] of each path; paths with the same sequence of nonzero numbers have the same code."""
     depth, code = np.diff(paths.first), np.zeros(paths.num_paths, dtype=np.int64)
     for step in range(int(depth.max(initial=0))):
         deep = np.flatnonzero(depth > step)

@@ -3,7 +3,7 @@
 Outside calls to Calibray, the user's settings apply.
 
 Within `jax_settings`, JAX computes in double precision and keeps compiled programs in a folder across processes. A
-compiled program is machine code, so Calibray reads it only from a folder to which no one but the user can write
+compiled program is machine code, so Calibray reads it only from a folder to which only the user can write
 (`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them.
 Calibray uses JAX's keys, which include everything on which a program depends, but reads and writes entries through its
 own store. If the user has set a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), JAX uses that folder instead.
@@ -78,7 +78,7 @@ def _check_device() -> None:
 
 @contextmanager
 def _cache_of_jax(programs: Any) -> Iterator[None]:
-    """Use the store as JAX's cache on disk.
+    """Make the store JAX's cache on disk.
 
     JAX has one cache for all threads, but each thread has its own setting for the folder. The store is therefore used
     only in threads whose setting is the store's folder, so that the user's own programs are not stored.
@@ -152,7 +152,7 @@ def _processor() -> str:
 
 
 WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
-"""Compiler option for vectors of 512 bits. XLA prefers 256 bits even on processors with wider vectors. On other
+"""Compiler option for 512-bit vectors. XLA prefers 256-bit vectors even on processors with wider ones. On other
 processors, the option has no effect. The option does not change results."""
 
 _QUICK: Final = WIDE | {"xla_cpu_use_fusion_emitters": False}

@@ -36,7 +36,7 @@ GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MaterialResponse:
-    """The material-dependent quantities of all interactions.
+    """The material-dependent quantities for all interactions.
 
     Attributes:
         coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K], or the tables of these
@@ -98,7 +98,7 @@ def response_and_derivatives(
 
 
 def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse) -> MaterialResponse:
-    """Derivatives with respect to conductivity, computed from those with respect to permittivity to save a pass.
+    """Derivatives with respect to conductivity; to save a pass, they follow from those with respect to permittivity.
 
     Coefficients are analytic in eta = eps_r - j loss, and the loss is proportional to the conductivity. The derivative
     with respect to the conductivity is therefore -j times the loss per unit of conductivity times the derivative with
@@ -124,9 +124,9 @@ def split_by_step(
 ) -> tuple[GroupResponse, ...]:
     """The response, or its derivatives, split into parts for each step of each group.
 
-    Reverse passes differentiate with respect to these parts. Differentiating with respect to the flat arrays would take
-    one pass over the complete arrays for each part. `blank` is the value of a coefficient at empty positions: 1, or 0
-    for derivatives.
+    Reverse passes differentiate with respect to these parts, because differentiating with respect to the flat arrays
+    would take one pass over the complete arrays for each part. `blank` is the value of a coefficient at empty
+    positions: 1, or 0 for derivatives.
     """
     groups, row = [], 0
     step_coefficients = _coefficients_by_step(program, response, blank)
@@ -184,7 +184,7 @@ LARGEST_EXPONENT = 64
 
 
 def pattern_value(table: jax.Array, diffuse: DiffuseArguments) -> jax.Array:
-    """Angular density f_s [D], [1/sr], of the diffusely reflected power, for constants [M, 8]."""
+    """Angular density f_s [D], [1/sr], of the diffusely reflected power, for material constants [M, 8]."""
     material, patterns, lambertian = diffuse.material, diffuse.patterns, diffuse.cos_scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):
         return lambertian

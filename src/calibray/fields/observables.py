@@ -1,4 +1,4 @@
-"""Observables other than path loss, modelled as a receiver measures them, with derivatives.
+"""Observables other than path loss, with derivatives, modelled as a receiver measures them.
 
 Each observable is a power-weighted statistic of the paths that a receiver resolves on a link. A receiver of limited
 bandwidth resolves taps instead of paths. Taps are samples of the power delay profile, in which the pulse of each path
@@ -46,7 +46,7 @@ class Taps:
         delay: Delay of every tap [T], [s].
         link: Link of every tap [T].
         index: Indices of the taps of every path [P, TAPS].
-        share: Share of the path's power in each of these taps [P, TAPS].
+        share: Share [P, TAPS] of the path's power in each of these taps.
     """
 
     delay: NDArray[np.float64]
@@ -58,8 +58,8 @@ class Taps:
     def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
         """The taps of paths, given their delays [P], [s], their links [P] and the bandwidth [Hz].
 
-        Taps are 1 / bandwidth apart. At this spacing, sampling preserves the power, mean delay and mean square delay of
-        the profile, regardless of the position of a path between two taps.
+        Taps are 1 / bandwidth apart. At the tap spacing used, sampling preserves the power, mean delay and mean square
+        delay of the profile, wherever a path lies between two taps.
         """
         # The two taps at or before the path, and the two after it.
         number = np.floor(delay * bandwidth).astype(np.int64)[:, None] + np.arange(TAPS) - TAPS // 2 + 1
@@ -87,7 +87,7 @@ class Taps:
 
 
 def hann_pulse(time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Power of the pulse of a receiver that applies a Hann window to its spectrum, at times in units of 1 / bandwidth.
+    """Pulse power, at times in units of 1 / bandwidth, for a receiver that applies a Hann window to its spectrum.
 
     The root mean square width of the pulse is 1 / (sqrt(3) bandwidth). Outside the main lobe, the power is set to 0.
     """
@@ -106,8 +106,8 @@ class Channel:
         program: The program, with delays.
         effects: Effects on the paths.
         base: Constants of the materials before calibration [M, 8].
-        departure: Zenith and azimuth of departure of every path [P, 2], [rad].
-        arrival: Zenith and azimuth of arrival of every path [P, 2], [rad].
+        departure: Zenith and azimuth angles [P, 2], [rad], of departure of every path.
+        arrival: Zenith and azimuth angles [P, 2], [rad], of arrival of every path.
         taps: The taps for each bandwidth that the statistics use.
         cells: For every material parameter: its index, and the row and column of its constant in `base`.
         of_effects: Indices of the parameters of effects.
@@ -126,7 +126,7 @@ class Channel:
 
     @jax_settings()
     def measuring(self, wanted: tuple[Statistic, ...]) -> Channel:
-        """The same channel with different statistics."""
+        """The same channel with other statistics."""
         link, delay = (np.asarray(part) for part in self.program.phases)
         taps = tuple(Taps.of(delay, link, bandwidth) for bandwidth in _bandwidths(wanted))
         return jax.device_put(replace(self, taps=taps, wanted=wanted))
@@ -152,7 +152,7 @@ def link_responses(
 def link_responses_and_slopes(
     channel: Channel, values: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """Path loss, statistics, and their derivatives with respect to the parameters [count, L, d], [count, K, L, d].
+    """Path loss, statistics, and their derivatives with respect to the parameters, [count, L, d] and [count, K, L, d].
 
     Derivatives of a statistic are NaN where the statistic is not finite.
     """
@@ -210,7 +210,7 @@ def _response(channel: Channel, values: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Array:
-    """One statistic of every link [L], from the powers of the paths [P]."""
+    """One statistic [L] of every link, from the powers [P] of the paths."""
     num_links, (link, delay) = channel.program.num_links, channel.program.phases
     taps, tap_delay, tap_link, tap_power = None, delay, link, power
     if wanted.bandwidth is not None:
@@ -247,7 +247,7 @@ def _statistic(channel: Channel, power: jax.Array, wanted: Statistic) -> jax.Arr
 
 
 def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) -> jax.Array:
-    """Detected share of every tap's power [T], as a function of the tap's level."""
+    """Detected share [T] of every tap's power, as a function of the tap's level."""
     level_db, seen = -decibel(power), jnp.ones_like(power)
     if wanted.dynamic_range_db is not None:
         strongest = jax.ops.segment_max(power, link, num_links)
@@ -263,7 +263,7 @@ def _seen(power: jax.Array, link: jax.Array, num_links: int, wanted: Statistic) 
 def _share(
     weight: jax.Array, value: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Share of each link's weight with values in the bin [L], [dB]; minus the dynamic range if the bin is empty."""
+    """Share [L], [dB], of each link's weight with values in the bin; minus the dynamic range if the bin is empty."""
     low, high = wanted.bin
     share = link_mean(weight, ((value >= low) & (value < high)).astype(weight.dtype), link, num_links)
     range_db = kinds.SHARE_RANGE_DB if wanted.dynamic_range_db is None else wanted.dynamic_range_db
@@ -275,7 +275,7 @@ def _share(
 def _flight(
     weight: jax.Array, seen: jax.Array, delay: jax.Array, link: jax.Array, num_links: int, wanted: Statistic
 ) -> jax.Array:
-    """Time of flight of every link [L], [s]: mean over all paths, or over one path and paths not resolved from it."""
+    """Time of flight [L], [s], of every link: mean over all paths, or over one path and those not resolved from it."""
     if wanted.path == "mean":
         return link_mean(weight, delay, link, num_links)
     if wanted.path == "first":
@@ -293,7 +293,7 @@ def _flight(
 
 
 def _angles(channel: Channel, kind: str) -> NDArray[np.float64]:
-    """Zenith or azimuth of every path at one end [P], [rad]."""
+    """Zenith or azimuth angle [P], [rad], of every path at one end."""
     at_departure = kind in (kinds.DEPARTURE_SPREAD, kinds.DEPARTURE_ELEVATION, kinds.DEPARTURE_SECTOR)
     angles = channel.departure if at_departure else channel.arrival
     return angles[:, 0 if kind in (kinds.DEPARTURE_ELEVATION, kinds.ARRIVAL_ELEVATION) else 1]

@@ -38,8 +38,8 @@ LARGE: Final = 50_000
 
 SMALL: Final = 300
 """Largest number of coefficients in a small program, which is compiled without XLA's fusion emitters. With 120
-coefficients, path loss and derivatives compile in 2.3 s instead of 3.4 s, and a candidate takes up to 20 us longer.
-With 960 coefficients, a candidate takes 135 us longer (`docs/measurements/speed.md`)."""
+coefficients, compiling path loss and derivatives takes 2.3 s instead of 3.4 s, and evaluating a candidate takes up to
+20 us longer. With 960 coefficients, evaluating a candidate takes 135 us longer (`docs/measurements/speed.md`)."""
 
 
 @jax.tree_util.register_dataclass
@@ -81,7 +81,7 @@ class FormulaArguments:
     Attributes:
         material: Material [K].
         cosine: Cosine of the angle of incidence [K].
-        transmitted: Whether the coefficient is a transmission coefficient [K].
+        transmitted: Whether each coefficient is a transmission coefficient [K].
         unreduced: Whether the coefficient is a reflection coefficient that scattering does not reduce, as in a diffuse
             interaction [K].
         blank: Whether the position is empty and its coefficient is 1 [K]; None if no position is empty.
@@ -108,7 +108,7 @@ class DiffuseArguments:
 
     Attributes:
         material: Material [D].
-        solid_angle: Solid angle of the ray tube, divided by its sampling probability [D], [sr].
+        solid_angle: Solid angle [D], [sr], of the ray tube, divided by its sampling probability.
         cos_scattered: Cosine of the angle between the scattered direction and the normal [D].
         cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
         cos_specular: Cosine of the angle between the scattered and specular directions [D]; empty if every material is
@@ -135,8 +135,8 @@ class GroupedProgram:
     Attributes:
         groups: The paths, grouped by sequence of interactions.
         by_link: Segments of the paths by link.
-        link: Link of every path, in the order of the groups [P]; None if only powers are summed.
-        delay: Delay of every path, in the order of the groups [P], [s]; None if only powers are summed.
+        link: Link [P] of every path, in the order of the groups; None if only powers are summed.
+        delay: Delay [P], [s], of every path, in the order of the groups; None if only powers are summed.
         wavelength: Wavelength [m].
         coefficients: Arguments of the slab formula, or positions in tables.
         diffuse: Arguments of the scattering patterns.
@@ -183,7 +183,7 @@ class GroupedProgram:
 
 @dataclass(frozen=True)
 class Layout:
-    """A grouped program, and the index of each of its paths in the path program [P]."""
+    """A grouped program, and the index [P] of each of its paths in the path program."""
 
     program: GroupedProgram
     order: NDArray[np.int64]
@@ -235,10 +235,10 @@ class _Numbering:
 
     Attributes:
         wedges: Interaction indices of the diffractions [W].
-        count: Number of coefficients; used as an index, this number marks an empty position.
-        table_row: Row of each interaction in the table of its kind, -1 for reflections and transmissions [I].
+        count: Number of coefficients, which also serves as the index that marks an empty position.
+        table_row: Row [I] of each interaction in the table of its kind; -1 for reflections and transmissions.
         steps: Indices of the coefficients at each step of each group, [n] or [k, n]; a diffraction has two steps.
-        scattered: Indices of the diffuse interactions in the order of use [D].
+        scattered: Indices [D] of the diffuse interactions in the order of use.
     """
 
     def __init__(self, paths: Paths, groups: list[PathGroup]) -> None:

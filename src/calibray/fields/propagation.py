@@ -34,7 +34,7 @@ class Keep(Protocol):
 def path_fields(
     program: GroupedProgram, responses: tuple[GroupResponse, ...], keep: Keep = lambda values: values
 ) -> Pair:
-    """Gains of all paths in the order of the groups, real and imaginary parts [R, T, P].
+    """Gains [R, T, P] of all paths in the order of the groups, as real and imaginary parts.
 
     `keep` is applied to the field after every interaction.
     """
@@ -49,7 +49,7 @@ def path_fields(
 
 
 def _group_gains(group: Group, response: GroupResponse, keep: Keep) -> Pair:
-    """Gains of one group's paths, real and imaginary parts [R, T, n].
+    """Gains [R, T, n] of one group's paths, as real and imaginary parts.
 
     The gain of a path is a = (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx; the factor (lambda / 4 pi) A is part of `rx`.
     """
@@ -175,13 +175,13 @@ class Combining:
 
 
 POWER: Final = Combining()
-"""Combining of paths by the sum of their powers."""
+"""Combining paths by summing their powers."""
 
 
 def _band_nodes(
     link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None
 ) -> NDArray[np.float64]:
-    """Gauss-Legendre nodes and weights over a band [2, q], with enough nodes for the largest delay span in any link.
+    """Gauss-Legendre nodes and weights [2, q] over a band, with enough nodes for the largest delay span of any link.
 
     The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A quadrature rule with n
     nodes integrates these oscillations to machine precision if n exceeds about ten plus a quarter of their phase change
@@ -201,7 +201,7 @@ def _band_nodes(
 
 
 def path_power(gain: Pair) -> jax.Array:
-    """Power gain of every path [P], summed over receive ports and averaged over transmit ports.
+    """Power gain [P] of every path, summed over receive ports and averaged over transmit ports.
 
     Path gains are given as real and imaginary parts [R, T, P].
     """
@@ -216,7 +216,7 @@ def link_power(
     frequency: jax.Array | float,
     combining: Combining = POWER,
 ) -> jax.Array:
-    """Power gain of every link [L] from its path gains [R, T, P]; 0 for a link without a path.
+    """Power gain [L] of every link, from its path gains [R, T, P]; 0 for a link without a path.
 
     With several ports, the power is summed over receive ports and averaged over transmit ports.
     """
@@ -247,6 +247,6 @@ def path_loss_of_gains(
     frequency: float,
     combining: Combining = POWER,
 ) -> NDArray[np.float64]:
-    """Path loss of every link [L], [dB], from complex path gains [P, R, T]; +inf for a link without a path."""
+    """Path loss [L], [dB], of every link, from complex path gains [P, R, T]; +inf for a link without a path."""
     real, imaginary = (jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
     return np.asarray(decibel(link_power((real, imaginary), link, delay, num_links, frequency, combining)))

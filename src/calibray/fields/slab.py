@@ -31,7 +31,7 @@ class Mode(IntEnum):
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
-    """Negative imaginary part of the complex relative permittivity [1], from a conductivity [S/m]."""
+    """Minus the imaginary part of the complex relative permittivity [1], from a conductivity [S/m]."""
     # ITU-R P.2040-3 eq. 9: eta'' = sigma / (2 pi f eps_0), f = c / lambda.
     return conductivity * wavelength / (2 * jnp.pi * speed_of_light * epsilon_0)
 

@@ -4,7 +4,7 @@
 - Constants that the scene fixes for the calibrated materials, such as thickness, are not known exactly. Such constants
   have a log-normal prior around the scene's value. A scattering coefficient of 0 is assumed to be exact with a
   probability of one half.
-- A constant of the walls of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
+- A wall constant of building b is x exp(s z_b), where x is the material's mean and z_b is standard normal. The
   between-building spread s is zero with probability `ALIKE`; otherwise it is exponentially distributed.
 - Errors follow one of several noise models (`noise_models.py`). The noise level, the nuisances and an undeclared offset
   are integrated out.
@@ -46,11 +46,11 @@ MAX_LINKS: Final = 300
 
 @dataclass(frozen=True, eq=False)
 class QuadraticForms:
-    """A marginal density, prepared for gaps each of which has its own noise model.
+    """A marginal density, prepared for evaluating each gap under its own noise model.
 
     Attributes:
         marginal: The density.
-        group: Group of each model; models of one group are evaluated together [models]. The group is -1 for Student's
+        group: Group [models] of each model; models of one group are evaluated together. The group is -1 for Student's
             t, -2 for gross errors, and otherwise the model's own index.
         square: For each Gaussian model, the matrix [m, m], constant and exponent of its quadratic form; None for other
             models. Empty if there are too many links or if any link is censored.
@@ -71,7 +71,7 @@ class QuadraticForms:
         return cls(marginal, np.array(group), tuple(square))
 
     def densities(self, gap: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Like `Marginal.densities`, but for each gap only under the model with the given index [n]."""
+        """Like `Marginal.densities`, but each gap is evaluated only under the model with the given index [n]."""
         models, log_density = self.marginal.models, np.full(len(gap), -np.inf)
         log_weight = np.log([other.weight for other in models])[model]
         if not self.square:
@@ -103,8 +103,8 @@ FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 """Material constants that are taken from the scene if they are not parameters."""
 
 NO_EFFECT: Final = 0.02
-"""A constant from the scene stays fixed if a change by one standard deviation changes path loss by less than this
-fraction of the noise level. The variance that the constant would add is then below 0.04 % of the noise variance."""
+"""A constant from the scene stays fixed if changing it by one standard deviation changes path loss by less than this
+fraction of the noise level. The constant would then add less than 0.04 % to the noise variance."""
 
 ALIKE: Final = 0.5
 """Prior probability that all buildings have equal constants."""
@@ -137,11 +137,11 @@ class JointModel:
         marginal: The density of the gaps under every noise model.
         parameter_of: Index of the parameter to which each of the c constants of individual buildings belongs [c].
         building_of: Index of the building of each of these constants [c].
-        only_buildings: Indices of the parameters whose constants all belong to buildings, so that the buildings alone
-            determine the mean.
+        only_buildings: Indices of the parameters whose constants all belong to buildings, so that these parameters
+            affect path loss only through the buildings' constants.
         spread: The between-building spread if the study declares it; otherwise None.
         interactions: Number of interactions per evaluation.
-        effects_db: Change in path loss for a change of each fixed constant by one standard deviation [dB].
+        effects_db: Change in path loss [dB] when each fixed constant changes by one standard deviation.
         observed: For each further observable, the number of its rows, its degrees of freedom, and whether its rows are
             in units of a stated error. These rows follow the m gaps of path loss.
     """
@@ -171,7 +171,7 @@ class JointModel:
         return self.marginal.densities(links) + further[:, None]
 
     def _split(self, gaps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Weighted differences of path loss [n, m], and the log likelihood of the further observables [n].
+        """Weighted gaps [n, m] of path loss, and the log likelihood [n] of the further observables.
 
         If the study does not state an observable's error, the error is integrated out, with a prior inversely
         proportional to the error.
@@ -257,9 +257,10 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
     design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
     used = objective.determined & ~at_bound
-    # Too few links cannot distinguish noise models or show differences between buildings, so only stated noise is used.
+    # Too few links can neither distinguish noise models nor reveal differences between buildings, so only stated noise
+    # is used.
     few = len(counted) < FEW
-    # With correlated errors, the probability of censoring would be a joint integral over all censored links.
+    # With correlated errors, the probability of censoring is a joint integral over all censored links.
     uncorrelated = bool(censored.any()) or (few and section.range_m == "auto")
     out_of_sight = not uncorrelated and section.range_m == "auto"
     models = noise_models(
@@ -377,7 +378,7 @@ def _with_constants(
 
 
 def _further(problem: Problem, observed: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Rows of each further observable [n, m], in units of the observable's error if the study states this error."""
+    """Rows [n, m] of each further observable, in units of the observable's error if the study states it."""
     rows = []
     for index, each in enumerate(problem.observed):
         residuals, _ = each.residuals(observed[:, index], problem.objective.weight)
@@ -396,7 +397,7 @@ def has_offset(problem: Problem) -> bool:
 def _fixed_constants(problem: Problem) -> list[Parameter]:
     """Constants of the calibrated materials that the scene fixes and that are equal at all carrier frequencies.
 
-    A scattering coefficient of 0 that the study states is exact for the material and its facades.
+    If the study states a scattering coefficient of 0, this value is exact for the material and its facades.
     """
     study = problem.setup.study
     materials, spread = problem.engine.materials, study.noise.constants_spread
@@ -426,8 +427,8 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Weights of the links in the likelihood [L], and the mask of the censored links [L].
 
-    If the likelihood contains censored links, it also contains the links measured near the noise floor, so that links
-    are not selected by their measured values.
+    If the likelihood contains censored links, it also contains the links measured near the noise floor, because
+    otherwise links would be selected by their measured values.
     """
     objective, links = problem.objective, problem.setup.links
     if links.censored is None or problem.faint is None:

@@ -1,4 +1,4 @@
-"""Laplace's approximation of error densities whose integrals over nuisance and scale have no closed form.
+"""Laplace's approximation for error densities whose integrals over nuisance and scale have no closed form.
 
 There are two models of heavy tails. Either the errors follow Student's t, with tails that decrease gradually, or most
 errors are Gaussian and a few are gross, for example because a link's position was recorded incorrectly. Gross errors
@@ -6,11 +6,11 @@ are Gaussian with a larger standard deviation (J. W. Tukey, in: Contributions to
 fit both distributions by iteratively reweighted least squares (K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am.
 Stat. Assoc. 84 (1989) 881) and integrate around the mode, using the Fisher information.
 
-Censored links are known only to lie below the noise floor. A measured link contributes the density of its error. A
-censored link contributes the probability that its error is at least as large as the floor requires (J. Tobin,
-Econometrica 26, 1958). Without the censored links, only links with favourable errors would remain near the floor. For
-errors e = s u, with u standard normal or Student's t, and nuisance coefficients b, damped Newton steps in b and log s
-maximize the logarithm of
+Of a censored link, it is known only that its power is below the noise floor. A measured link contributes the density of
+its error. A censored link contributes the probability that its error is at least as large as the floor requires (J.
+Tobin, Econometrica 26, 1958). Without the censored links, only links with favourable errors would remain near the
+floor. For errors e = s u, with u standard normal or Student's t, and nuisance coefficients b, damped Newton steps in b
+and log s maximize the logarithm of
 
     p(b, s) = prod_measured f((y - z.b) / s) / s  x  prod_censored S((y - z.b) / s)  x  prior(b) / s.
 """
@@ -44,9 +44,7 @@ class _Terms(NamedTuple):
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
     """Log probability that a Student's t variable exceeds an error; a Gaussian variable if `freedom` is infinite.
 
-    Example:
-        >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()
-        [-0.69, -804.61]
+    Example: >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist() [-0.69, -804.61]
     """
     return log_ndtr(-error) if np.isinf(freedom) else np.log(np.maximum(stdtr(freedom, -error), 1e-300))
 
@@ -185,8 +183,8 @@ MAX_STEPS: Final = 25
 """Maximum number of steps to the mode."""
 
 TOLERANCE: Final = 1e-3
-"""Change of errors and scale, relative to the scale, at which the iteration ends. A smaller limit is not needed,
-because the density is flat at the mode."""
+"""Change of errors and scale, relative to the scale, at which the iteration ends. The density is flat at the mode, so a
+smaller limit is not needed."""
 
 GROSS_SHARE: Final = 0.1
 """Share of gross errors."""
@@ -206,9 +204,9 @@ class Tail(NamedTuple):
         weight: Minus the derivative of the log density with respect to half the square; 1 for a Gaussian.
         location: Fisher information of an error about its mean; a number or an array [n].
         size: Fisher information of an error about the logarithm of its scale; a number or an array [n].
-        by_weights: Whether to update the scale with the sum of the weights instead of the number of links; this
+        by_weights: Whether to update the scale with the sum of the weights instead of the number of links, which
             converges faster.
-        select: Returns the distributions of the gaps with given indices.
+        select: The distributions for the gaps with the given indices.
     """
 
     log_density: OfSquare
@@ -243,7 +241,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross() -> Tail:
-    """Gaussian errors; a fraction `GROSS_SHARE` of them have a standard deviation `GROSS_RATIO` times as large."""
+    """Gaussian errors, a fraction `GROSS_SHARE` of which have a standard deviation `GROSS_RATIO` times as large."""
     share, times = GROSS_SHARE, GROSS_RATIO
     ratio, fall = share / (1.0 - share) / times, 0.5 * (1.0 - 1.0 / times**2)
     constant = float(np.log1p(-share) - 0.5 * np.log(2 * np.pi))
@@ -315,7 +313,7 @@ def _mode(
     links, columns = design.shape
     outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
     errors, coefficients, change = gap, np.zeros((len(gap), columns)), np.float64(0.0)
-    # Gaps leave the iteration once they have converged; `rows` contains the indices of the remaining gaps.
+    # A gap leaves the iteration once it has converged; `rows` contains the indices of the remaining gaps.
     mode, rows = (gap.copy(), coefficients.copy(), size.copy()), np.arange(len(gap))
     for step in range(MAX_STEPS):
         variance = size**2

@@ -1,8 +1,8 @@
 """Search for a missing region, such as unmapped trees, whose extra loss best explains the residuals.
 
-For each rectangle of cells of a grid, at several heights, the residuals are regressed on the length of every link's
-straight line inside the rectangle. The same search on randomly permuted residuals shows how much chance alone can
-explain (a scan statistic; M. Kulldorff, Communications in Statistics 26, 1997).
+For each rectangle of cells of a grid, at several heights, the residuals are regressed on the length, inside the
+rectangle, of every link's straight line. Repeating the search on randomly permuted residuals shows how much a rectangle
+can explain by chance alone (a scan statistic; M. Kulldorff, Communications in Statistics 26, 1997).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SAMPLES: Final = 128
 """Number of points along each line, enough for several points in each cell that the line crosses."""
 
 HEIGHTS: Final = (5.0, 10.0, 20.0)
-"""Heights of the rectangles' tops above the lowest antenna [m], for hedges, street trees and tall trees."""
+"""Heights [m] of the rectangles' tops above the lowest antenna, for hedges, street trees and tall trees."""
 
 FEWEST_LINKS: Final = 30
 """Minimum number of links for a search."""
@@ -32,8 +32,8 @@ MOST: Final = 20_000
 """Maximum number of links in a search; if there are more links, only every kth link is used."""
 
 SHUFFLES: Final = 99
-"""Number of random permutations of the residuals. A rectangle is significant only if the best rectangle of every
-permutation explains less."""
+"""Number of random permutations of the residuals. A rectangle is significant only if it explains more than the best
+rectangle of every permutation."""
 
 
 class Explained(NamedTuple):
@@ -43,7 +43,7 @@ class Explained(NamedTuple):
         explained: Sum of squares that the rectangle explains.
         attenuation: Its attenuation [dB/m].
         cells: South-west and north-east corners of the rectangle, in cells [2, 2].
-        chance: Sum of squares that the best rectangle of this width explains for each permutation [k - 1].
+        chance: Sum of squares [k - 1] that the best rectangle of this width explains for each permutation.
     """
 
     explained: float
@@ -62,7 +62,7 @@ class MissingRegion:
         attenuation: Loss per length inside [dB/m].
         links: Number of links whose straight line crosses the region; an estimate if not all links are used.
         share: Fraction of the mean square of the residuals that the rectangle explains.
-        chance: Median fraction of the mean square that the best rectangle explains if the residuals are permuted.
+        chance: Median, over permutations, of the fraction of the mean square that the best rectangle explains.
         significant: Whether at least `FEW` links cross the region, and the best rectangle of every permutation explains
             less.
     """
@@ -93,11 +93,10 @@ def missing_region(
         tx: Positions of the transmitters [n, 3], [m].
         rx: Positions of the receivers [n, 3], [m].
         excess_db: Measured minus predicted path loss [n], [dB].
-        known: Columns that are other possible explanations of the residuals, such as whether a link is out of sight
-            [n].
+        known: Columns [n] that could also explain the residuals, such as whether a link is out of sight.
 
     Returns:
-        The rectangle; None if there are too few links, or if no rectangle with extra loss explains any of the
+        The rectangle; None if there are too few links, or if no rectangle with extra loss explains any part of the
         residuals.
     """
     if len(excess_db) < FEWEST_LINKS:
@@ -124,7 +123,7 @@ def missing_region(
         # Keep the part of the lengths that the fitted columns do not explain.
         inside = length - basis @ (basis.T @ length)
         rectangles = list(_rectangles(inside.T @ orders.T, inside.T @ inside))
-        # Permuted residuals are tested with the same heights and rectangles.
+        # Permuted residuals are searched with the same heights and rectangles.
         chance = np.maximum(chance, np.max([rectangle.chance for rectangle in rectangles], axis=0))
         top = max(rectangles, key=lambda rectangle: rectangle.explained)
         if top.explained / square > (0.0 if best is None else best.share):
@@ -159,12 +158,12 @@ def _grid(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[NDArray[np.
 def _lengths(
     tx: NDArray[np.float64], rx: NDArray[np.float64], corner: NDArray[np.float64], cell: float, top: float
 ) -> NDArray[np.float64]:
-    """Length of the part of each line below the height `top`, in each cell of the grid [n, cells], [m]."""
+    """Length [n, cells], [m], in each cell of the grid, of the part of each line below the height `top`."""
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES
     point = tx[:, None] + share[:, None] * (rx - tx)[:, None]
     index = np.clip(((point[..., :2] - corner) / cell).astype(np.int64), 0, GRID - 1)
     number = np.arange(len(tx))[:, None] * GRID**2 + index[..., 0] * GRID + index[..., 1]
-    # Each point represents a piece of its line; pieces above `top` do not count.
+    # Each point represents a segment of its line; segments above `top` do not count.
     piece = np.linalg.norm(rx - tx, axis=1)[:, None] / SAMPLES * (point[..., 2] < top)
     counts = np.bincount(number.reshape(-1), piece.reshape(-1), len(tx) * GRID**2)
     return counts.reshape(len(tx), GRID**2).astype(np.float64)
@@ -173,8 +172,8 @@ def _lengths(
 def _rectangles(moments: NDArray[np.float64], products: NDArray[np.float64]) -> Iterator[Explained]:
     """The best rectangle of the grid for each width.
 
-    `moments` contains the scalar products of the cells' columns with the residuals, unpermuted residuals first [cells,
-    k]. `products` contains the scalar products of the cells' columns with each other [cells, cells].
+    `moments` [cells, k] contains the scalar products of the cells' columns with the residuals, unpermuted residuals
+    first. `products` [cells, cells] contains the scalar products of the cells' columns with each other.
     """
     moment = _summed(moments.reshape(GRID, GRID, -1), (0, 1))
     total = _summed(products.reshape((GRID,) * 4), (0, 1, 2, 3))

@@ -5,7 +5,7 @@ There may be an undeclared offset. Larger errors out of sight are a discrepancy 
 A. O'Hagan, J. Royal Statistical Society B 63, 2001): paths that the twin lacks change the path loss of its weak links
 (`excess_db`). The right model is unknown, and choosing the best-fitting model would ignore models that fit nearly as
 well. Every model therefore has a prior weight, and results are averages over all models (Bayesian model averaging). A
-discrepancy that the data do not support receives almost no weight, and does not absorb effects that the parameters
+discrepancy that the data do not support receives almost no weight and so does not absorb effects that the parameters
 explain.
 
 The noise level has the prior 1/level. The priors of nuisances are flat unless the study declares them. For Gaussian
@@ -43,15 +43,16 @@ from calibray.uncertainty.residual_correlation import (
 )
 
 CANDIDATES: Final = 16
-"""Number of candidates within the bounds; the scene's prediction for a link is the median path loss over these
-candidates."""
+"""Number of candidates within the bounds; the median of a link's path loss over these candidates is the scene's
+prediction."""
 
 STRONGEST: Final = 0.05
-"""Quantile of the excess loss that represents the strongest links, which are line-of-sight links if there are any."""
+"""Quantile of the excess loss that represents the strongest links, which are the line-of-sight links if there are
+any."""
 
 
 def excess_db(problem: Problem) -> NDArray[np.float64]:
-    """Excess over free-space loss of links out of sight, relative to the excess of the strongest links [L], [dB].
+    """Excess [L], [dB], over free-space loss of links out of sight, relative to the excess of the strongest links.
 
     The excess is the median over candidates within the bounds. It is minus infinity for line-of-sight links and for
     links without a path.
@@ -69,16 +70,16 @@ def excess_db(problem: Problem) -> NDArray[np.float64]:
 
 
 def missing_db(excess: NDArray[np.float64], level: float) -> NDArray[np.float64]:
-    """Change of path loss [dB] due to missing power `level` dB below the line of sight, at the given excess losses."""
+    """Change in path loss [dB], at the given excess losses, due to missing power `level` dB below the line of sight."""
     # 10 log10(1 + 10^((excess - level) / 10)), without overflow.
     return 10.0 * np.logaddexp(0.0, (excess - level) * (0.1 * np.log(10.0))) / np.log(10.0)
 
 
 OFFSET_DB: Final = 6.0
-"""Prior standard deviation of an undeclared offset, for example from a cable or an antenna gain [dB]."""
+"""Prior standard deviation [dB] of an undeclared offset, for example from a cable or an antenna gain."""
 
 NO_OFFSET: Final = 1e3
-"""Inverse prior standard deviation that keeps an offset at 0 [1/dB]."""
+"""Inverse prior standard deviation [1/dB] that keeps an offset at 0."""
 
 SHARES: Final = (0.4, 0.7, 0.95)
 """Trial values of the correlated fraction of the variance."""
@@ -87,8 +88,8 @@ RANGES: Final = 4
 """Number of trial correlation ranges, from the distance between neighbours to a third of the campaign's extent."""
 
 SAME_PLACE: Final = 0.01
-"""Correlation range, relative to the distance between neighbours, that represents errors shared only by links at the
-same position."""
+"""Correlation range, relative to the distance between neighbours, for errors shared only by links at the same
+position."""
 
 FREEDOMS: Final = (2.0, 4.0)
 """Trial values of the degrees of freedom of Student's t."""
@@ -108,8 +109,8 @@ LEVELS: Final = (5.0, 15.0, 25.0)
 districts with twins that lack refraction, the missing power is 2 to 35 dB below the power in sight."""
 
 COMMON: Final = 0.5
-"""Fraction of the variance of errors out of sight that all links have in common, because missing paths can only add
-power."""
+"""Fraction of the variance of errors out of sight that all links share; there is a shared part because missing paths
+can only add power."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, OUT_OF_SIGHT, HEAVY = "gaussian", "correlated", "out_of_sight", "student-t"
@@ -216,13 +217,13 @@ class Marginal:
     """Marginal density of the measurements for given path loss, under several noise models.
 
     Attributes:
-        design: Columns of the nuisance, times the square roots of the weights [m, q].
+        design: Columns [m, q] of the nuisance, times the square roots of the weights.
         ridge: Ratio of the noise level to each coefficient's prior standard deviation [q]; 0 for a flat prior.
-        column: The column of an undeclared offset, multiplied by the same square roots [m].
+        column: The column [m] of an undeclared offset, multiplied by the same square roots.
         noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
         whiteners: Whitener of each "correlated" or "out_of_sight" model, by kind, range and share.
-        censored: Mask of the censored links, whose gaps are lower limits [m]; if any link is censored, no model has a
+        censored: Mask [m] of the censored links, whose gaps are lower limits; if any link is censored, no model has a
             whitener.
     """
 
@@ -249,13 +250,13 @@ class Marginal:
         """Set up the density over m links.
 
         Args:
-            design: Columns of the nuisance, not scaled [m, q].
+            design: Columns [m, q] of the nuisance, unscaled.
             ridge: Ratio of the noise level to each coefficient's prior standard deviation [q]; 0 for a flat prior.
-            scale: Square roots of the links' weights, with mean square one [m].
+            scale: Square roots [m] of the links' weights, with a mean square of one.
             position: Positions of the links' ends [m, 3 or 6], [m].
             noise_db: Approximate noise level [dB].
             models: The noise models.
-            censored: Mask of the censored links [m]; if None, no link is censored.
+            censored: Mask [m] of the censored links; if None, no link is censored.
             excess_db: Values of the function `excess_db` at these links [m], [dB]; None if no model is "out_of_sight".
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
@@ -273,16 +274,16 @@ class Marginal:
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
     def without_improbable(self, gap: NDArray[np.float64]) -> Marginal:
-        """The density without models that fit the gaps at the optimum [1, m] much worse than the best model."""
+        """The density, without models that fit the gaps [1, m] at the optimum much worse than the best model."""
         density = self.densities(gap)[0]
         kept = np.flatnonzero(density > density.max() - IMPROBABLE)
         return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
 
     def densities(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log density of the measurements plus the log weight, for each model [n, models]; -inf if a gap is not finite.
+        """Log density of the measurements plus log weight of the model [n, models]; -inf if a gap is not finite.
 
-        Gaps are measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
-        [dB].
+        Gaps [n, m], [dB], are measured minus modelled path loss, without the nuisance, times the square roots of the
+        weights.
         """
         log_density = np.full((len(gap), len(self.models)), -np.inf)
         finite = np.asarray((np.isfinite(gap) | (self.censored & (gap < 0))).all(axis=1))
@@ -357,7 +358,7 @@ def _constant(freedom: int, ridge: NDArray[np.float64]) -> float:
 def _plain(
     gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Log density p of whitened Gaussian errors (see the module's docstring) [n]; the caller adds the term of |C|."""
+    """Log density p [n] of whitened Gaussian errors (see the module's docstring); the caller adds the term of |C|."""
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:

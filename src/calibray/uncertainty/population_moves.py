@@ -3,7 +3,7 @@
 - One or more parameters move along the difference between two other members (C. J. F. ter Braak, Statistics and
   Computing 16, 2006).
 - One parameter is redrawn from the smoothed density of its values in the population. Because of reflections inside
-  walls, several narrow ranges of permittivity can fit; a member can reach any of these ranges in one move.
+  walls, several narrow ranges of permittivity can fit, and this move can take a member to any of them.
 - The constants of one, two or all buildings are redrawn around their current values (S. L. Cotter, G. O. Roberts, A. M.
   Stuart and D. White, Statistical Science 28, 2013).
 - The between-building spread and the constants of all buildings are redrawn from their prior. The buildings then become
@@ -27,15 +27,16 @@ SPREAD_GRID: Final = 64
 """Number of points of the logarithmic grid from which the spread is drawn."""
 
 ACCEPTANCE: Final = 0.25
-"""Target acceptance rate, which determines the lengths of moves. The target is near 0.234, the optimum for random walks
+"""Target acceptance rate, which determines the lengths of moves. It is near 0.234, the optimum for random walks
 (G. O. Roberts, A. Gelman and W. R. Gilks, Annals of Applied Probability 7, 1997)."""
 
 JITTER: Final = 1e-4
-"""Standard deviation of the random displacement added to moves along differences, so that every point can be
+"""Standard deviation of the random displacement that is added to moves along differences so that every point can be
 reached."""
 
 NEIGHBOURHOOD: Final = 32
-"""On average, one kernel width on either side spans a fraction 1 / `NEIGHBOURHOOD` of the population."""
+"""On average, the range of one kernel width on either side contains a fraction 1 / `NEIGHBOURHOOD` of the
+population."""
 
 TINY: Final = 1e-30
 """Value that replaces a constant of 0 in logarithms; multiplying a constant of 0 by a factor has no effect."""
@@ -50,7 +51,7 @@ class Population:
 
     Attributes:
         point: Points of the unit cube [n, d + k].
-        deviation: Standardised deviations z of the buildings' constants [n, c].
+        deviation: Standardized deviations z [n, c] of the buildings' constants.
         spread: Between-building spread [n].
         model: Index of the noise model [n].
         gap: Weighted difference between measured and modelled path loss [n, m], [dB].
@@ -71,7 +72,7 @@ class Population:
         return Population(*(part[index] for part in self.parts()))
 
     def updated(self, accepted: NDArray[np.bool_], proposal: Population) -> Population:
-        """The population in which proposed members replace current members where the proposal is accepted [n]."""
+        """The population after accepted proposals, marked by a mask [n], have replaced the current members."""
         return Population(
             *(
                 np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
@@ -93,7 +94,7 @@ class Lengths:
     """Lengths of moves, adapted to their acceptance rates.
 
     Attributes:
-        buildings: Length of a move of all buildings; with 1, the draws are independent of the current values.
+        buildings: Length of a move of all buildings; if 1, the draws are independent of the current values.
         points: Length of a move along a difference, relative to the optimum for a normal density.
     """
 
@@ -141,7 +142,7 @@ class Moves:
         return population
 
     def _move_points(self, population: Population, lengths: Lengths) -> tuple[Population, Lengths]:
-        """Move along the difference between two other members; a third of the moves use the full difference."""
+        """Move along the difference between two other members; one move in three uses the full difference."""
         random = self.random
         count, width = population.point.shape
         shift = random.choice(np.arange(1, count), 2, replace=False)
@@ -182,7 +183,8 @@ class Moves:
     def _at_points(
         self, population: Population, point: NDArray[np.float64], log_ratio: float | NDArray[np.float64] = 0.0
     ) -> tuple[Population, NDArray[np.bool_]]:
-        """The population with accepted points [n, d + k], and their mask [n]; points out of bounds need no replay."""
+        """The population after proposing points [n, d + k], and the mask [n] of accepted ones; no replay if out of
+        bounds."""
         inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal, log_ratio)
@@ -212,7 +214,7 @@ class Moves:
         return population.updated(accepted, proposal), replace(lengths, buildings=buildings)
 
     def _redraw_all_buildings(self, population: Population) -> Population:
-        """Propose spread and deviations from their prior, so that buildings become equal or differ more or less."""
+        """Propose spread and deviations from their prior, so that buildings become equal or differ by more or less."""
         count = len(population.spread)
         proposal = replace(
             population,

@@ -5,8 +5,8 @@ and the observables require different parameter values. The parameters are fitte
 observables alone, and to both. The test statistic is the increase in both sums of squares from the separate fits to the
 common fit, divided by the variances of the errors and by the number of parameters. This statistic follows an F
 distribution if one set of parameters explains all data. It is also possible that no parameter values explain an
-observable, as if the observable were measured in a different scene. Measured values are therefore regressed on modelled
-values. The slope is 1 if the model is right, and near 0 if measured and modelled values are unrelated.
+observable, for example because it was measured in a different scene. Measured values are therefore regressed on
+modelled values. The slope is 1 if the model is right, and near 0 if measured and modelled values are unrelated.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ SIGNIFICANT: Final = 0.005
 Errors shared by neighbouring links make small p-values slightly more common."""
 
 UNRELATED: Final = 0.02
-"""An observable is reported as not fitting the scene if the probability of a slope this small under the model is below
-this value, divided by the number of observables."""
+"""An observable is reported as not fitting the scene if the p-value of its slope (the probability, under the model, of
+a slope this small) is below this value divided by the number of observables."""
 
 FEWEST: Final = 5
 """Minimum number of degrees of freedom for testing a slope."""
@@ -138,7 +138,7 @@ def _slopes(problem: Problem, point: NDArray[np.float64]) -> list[Slope]:
 
 
 def _weighted(problem: Problem, weight: float) -> Problem:
-    """The problem with the rows of its further observables multiplied by a weight."""
+    """The problem, with the rows of its further observables multiplied by a weight."""
     return replace(problem, observed=tuple(replace(each, std=each.std / weight) for each in problem.observed))
 
 
@@ -151,15 +151,15 @@ def _squares(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64
 
 
 LIKELY: Final = 0.75
-"""Probability above which a departure from independent Gaussian errors, or from equal buildings, is reported: odds of
-three to one. A priori, buildings differ with a probability of one half."""
+"""Probability above which a departure from independent Gaussian errors or from equal buildings is reported; the odds
+are then three to one. A priori, buildings differ with a probability of one half."""
 
 NOTABLE: Final = 0.25
 """Minimum posterior weight of a kind of noise that is reported; several kinds of noise can share the weight."""
 
 SLACK: Final = 0.02
-"""A calibrated value is reported if its distance from its interval exceeds this fraction of the search range. The
-search range is logarithmic for a parameter with a logarithmic scale."""
+"""A calibrated value outside its interval is reported if its distance from the interval exceeds this fraction of the
+search range. The search range is logarithmic for a parameter with a logarithmic scale."""
 
 MISSED_DB: Final = 0.01
 """The method is reported to have missed the optimum if the objective of a draw is lower by at least this much [dB]."""
@@ -180,7 +180,8 @@ DEPARTURES: Final = {
 
 
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
-    """A remark for each noise model that the data favour over independent Gaussian noise, from the posterior weights.
+    """A remark for each noise model whose posterior weight shows that the data favour it over independent Gaussian
+    noise.
 
     Noise that the study states is not reported. A remark about errors out of sight lists tracer settings that add
     paths.
@@ -215,7 +216,7 @@ def _lacking(study: StudyModel) -> list[str]:
 
 
 def missed(problem: Problem, posterior: Draws, best_value: float) -> tuple[Remark, ...]:
-    """A remark if a draw's objective [dB] is lower than the method's best objective by at least `MISSED_DB`."""
+    """A remark if a draw's objective [dB] is at least `MISSED_DB` below the method's best objective."""
     top = posterior.point[np.argsort(-posterior.density)[:16]]
     lowest = float(problem.squares(top).value.min())
     if lowest > best_value - MISSED_DB:
@@ -239,7 +240,7 @@ def outside_interval(
         problem: The problem.
         optimum: The calibrated values by parameter.
         intervals: The intervals.
-        most_probable: The values, by parameter, of the draw with the highest density at the scene's constants.
+        most_probable: The parameter values, by name, of the draw with the highest density at the scene's constants.
         log_odds: Log density of this draw minus the log density of the calibrated values.
         noise: Posterior weights of the noise models.
     """
@@ -272,7 +273,7 @@ class UndeclaredOffset(NamedTuple):
     """An offset for all links, fitted in addition to the study's model.
 
     Attributes:
-        offset_db: The best offset [dB]; None if the study declares an offset, or if an offset does not improve the fit.
+        offset_db: The best offset [dB]; None if the study declares an offset, or an offset does not improve the fit.
         error_db: Its standard error [dB].
         remarks: A warning if the offset is significant.
     """
@@ -285,7 +286,7 @@ class UndeclaredOffset(NamedTuple):
 def fit_undeclared_offset(
     problem: Problem, minima: NDArray[np.float64], square: float, freedom: int
 ) -> UndeclaredOffset:
-    """Fit an offset for all links if the study declares no offset, and test the significance of this offset.
+    """Fit an offset for all links if the study declares none, and test its significance.
 
     Args:
         problem: The problem.

@@ -1,9 +1,9 @@
 """Spatial correlation of errors: restricted-likelihood fit, significance test, variogram and whitening.
 
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
-because clutter that the scene lacks shadows all these receivers. The covariance of this part falls off exponentially
-with distance. Range and size maximize the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971),
-which prevents the fit of the parameters from biasing the noise estimate downwards. The fit is exact, with one Cholesky
+because clutter that the scene lacks shadows all of them. The covariance of this part falls off exponentially with
+distance. Range and size maximize the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971),
+which prevents the fit of the parameters from biasing the noise estimate downward. The fit is exact, with one Cholesky
 factorization per trial, for up to a few thousand links.
 
 Whitening makes errors independent. For up to a few hundred links, the covariance matrix of the errors is factored. For
@@ -83,13 +83,13 @@ class Correlation:
 def fit_correlation(
     errors: NDArray[np.float64], position: NDArray[np.float64], design: NDArray[np.float64] | None = None
 ) -> Correlation:
-    """Fit range and size of the correlated part of errors [m], [dB], by restricted maximum likelihood.
+    """Fit the range and size of the correlated part of the errors by restricted maximum likelihood.
 
     The positions [m, k], [m], are those of the receivers or of both ends. The columns of `design` [m, q], which has
     full rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
 
     Raises:
-        InputError: The number of links exceeds the number of columns by fewer than three, or all receivers share one
+        InputError: The number of links exceeds the number of columns by less than three, or all receivers share one
             position.
         EngineError: The errors are all zero.
     """
@@ -152,7 +152,7 @@ def _restricted(
 
 
 def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) -> Correlation | None:
-    """The correlation of the best fit's errors [m], [dB], at positions [m, k], [m]; None if not significant."""
+    """The correlation of the best fit's errors at positions [m, k], [m]; None if it is not significant."""
     if len(errors) < FEWEST_LINKS:
         return None
     chosen = evenly_spaced(len(errors), MOST_LINKS)
@@ -167,7 +167,7 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
 def variogram(
     errors: NDArray[np.float64], position: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Empirical variogram: half the mean squared difference between errors versus the distance between links.
+    """Empirical variogram: half the mean squared difference between errors, as a function of link distance.
 
     A rising variogram indicates correlated errors, and a flat variogram indicates independent errors. Errors [m] are in
     dB. The positions [m, k], [m], are those of the receivers or of both ends. The result is the mean distance [8], [m],
@@ -190,10 +190,10 @@ def variogram(
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """A factor of the inverse of a covariance.
+    """A factor of the inverse of a covariance matrix.
 
     Attributes:
-        factor: Matrix that transforms the errors into independent errors of unit variance [m, m].
+        factor: Matrix [m, m] that transforms the errors into independent errors of unit variance.
         log_determinant: Log determinant of the covariance.
     """
 
@@ -206,7 +206,7 @@ class Whitener:
 
 
 def pairwise(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances [m, m] between link positions [n, k]; a subset of at least `EXACT` links is used if there are many."""
+    """Distances [m, m] between link positions [n, k]; if there are many links, a subset of at least `EXACT` is used."""
     subset = position[:: max(1, len(position) // EXACT)]
     return np.asarray(cdist(subset, subset), dtype=np.float64)
 
@@ -219,7 +219,7 @@ def whitener(
     exact: int = EXACT,
     neighbours: Neighbours | None = None,
 ) -> Whitener:
-    """Make the whitener of the errors of links with end positions [m, k], [m].
+    """Make the whitener for the errors of links with end positions [m, k], [m].
 
     The errors have been multiplied by `scale` [m], so that the uncorrelated part has the same variance for all links.
     The correlated part has the fraction `share` of the variance, from 0 to below 1. The covariance of this part falls
@@ -236,7 +236,7 @@ def whitener(
 def shared(error: NDArray[np.float64], share: float) -> Whitener:
     """The whitener of errors of unit variance plus further errors with the standard deviations `error` [m].
 
-    The links have the fraction `share` of the further variance in common. For more than `EXACT` links, errors are
+    The links share the fraction `share` of the further variance. For more than `EXACT` links, errors are
     treated as independent.
     """
     if len(error) > EXACT:

@@ -1,4 +1,4 @@
-"""Uncertainty for measurements that favour paths left out by the study's trace.
+"""Uncertainty for measurements that favour paths which the study's trace leaves out.
 
 If a digital twin lacks paths, such as paths through buildings, its intervals are centred on wrong values, because the
 constants compensate for the missing power. The links are therefore traced once more with refraction and diffraction.
@@ -44,11 +44,11 @@ OF_THE_FIT: Final = (RemarkKind.MISSED_OPTIMUM, RemarkKind.OUTSIDE_INTERVAL)
 def assess_richer_paths(
     problem: Problem, trail: Trail, assessed: Certainty, progress: Progress | None = None
 ) -> Certainty:
-    """The uncertainty with richer paths, and a remark, if the measurements favour these paths; otherwise `assessed`.
+    """The uncertainty with richer paths, and a remark, if the measurements favour them; otherwise `assessed`.
 
-    Nothing is traced if `lacking` returns no settings. There are no settings, for example, if the study states the
-    noise, if its `fidelity.rounds` is 0, or if no link is out of sight. The stages of `progress` are "tracing more
-    paths", "fitting more paths" and "drawing with more paths".
+    Nothing is traced if `lacking` returns no settings, for example because the study states the noise, its
+    `fidelity.rounds` is 0, or no link is out of sight. The stages of `progress` are "tracing more paths", "fitting more
+    paths" and "drawing with more paths".
 
     Args:
         problem: The problem.
@@ -79,7 +79,7 @@ def assess_richer_paths(
     method = LeastSquares(*problem.parameters.search_bounds, starts=STARTS[0], x0=trail.minima[:BASINS])
     fitted = search(richer, method, with_stage(progress, "fitting more paths"))
     calls = assessed.calls + fitted.rt_calls
-    # First test the likelihood ratio for Gaussian errors of unknown level, because draws take much longer.
+    # First test the likelihood ratio for Gaussian errors of unknown level, because drawing takes much longer.
     if (
         counted.sum() * (np.log(trail.best_value) - np.log(max(fitted.best_value, EXACT_DB)))
         < LIKELY_LOG_ODDS

@@ -1,13 +1,13 @@
 """Draws from the joint posterior by tempered sequential Monte Carlo.
 
-A population is drawn from the prior, and follows the prior times a power of the likelihood as the power grows to 1 (P.
-Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until the
-effective size of the population falls to half of its members, resamples the population, and moves its members
+A population is drawn from the prior, and follows the prior times a power of the likelihood as this power grows from 0
+to 1 (P. Del Moral, A. Doucet and A. Jasra, J. Royal Statistical Society B 68, 2006). Each step raises the power until
+the effective size of the population falls to half of its members, resamples the population, and moves its members
 (`population_moves.py`).
 
-We start with two independent populations, and double their number as long as the two halves of the populations disagree
-and the budget permits. If the halves agree, each population is weighted by its estimate of the evidence, which is
-unbiased. Small populations that disagree are replaced by larger ones if the calibration made enough RT calls.
+We start with two independent populations, and double their number as long as one half of the populations disagrees with
+the other and the budget permits. If the halves agree, each population is weighted by its estimate of the evidence,
+which is unbiased. Small populations that disagree are replaced by larger ones if the calibration made enough RT calls.
 """
 
 from __future__ import annotations
@@ -27,30 +27,28 @@ SIZE: Final = (64, 256)
 """Minimum and maximum number of members of a population."""
 
 BUDGET: Final = 1_100_000_000
-"""Number of interactions that all populations together may evaluate. With a budget 10 % smaller, the draws in Auckland
-correspond to 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
+"""Number of interactions that may be evaluated for all populations together. With a budget 10 % smaller, the draws in
+Auckland correspond to 392 to 422 independent draws (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 EVALUATIONS: Final = 100
 """Approximate number of evaluations per member: the number of steps times the number of moves per step."""
 
 POPULATIONS: Final = (2, 4, 8)
 """Possible numbers of independent populations; the number is increased as long as the two halves disagree. If several
-slab resonances fit the data, the mean of a population of 256 members scatters by 0.2 posterior standard deviations. In
-three development districts, two or four populations agree for half of the true scenes."""
+slab resonances fit the data, the mean of a population of 256 members varies by 0.2 posterior standard deviations. In
+three development districts, two or four populations suffice for agreement in half of the true scenes."""
 
 SWEEPS: Final = 4
 """Number of sweeps per step; a sweep applies each kind of move to every member. In a five-dimensional test with two
-distant ranges, the weight of one range then scatters by 0.03 between seeds. With 2 sweeps, this weight scatters by
-0.08."""
+distant ranges, the weight of one range then varies by 0.03 between seeds, compared with 0.08 for 2 sweeps."""
 
 LAST_SWEEPS: Final = (8, 48)
-"""Minimum and maximum number of further sweeps at power 1. A population that is smaller because of the budget gets more
-sweeps, so that it provides as many draws as a larger population. For a small path program, the number of sweeps is as
-large as the budget permits. The reference is a posterior from a million draws from the prior
-(`benchmarks/simulation_based.py --reference`). In districts with 300 to 800 interactions, distribution functions after
-8, 24 and 48 sweeps differ from this reference by 0.053, 0.043 and 0.036. In Auckland, the widths of intervals differ
-between seeds by up to 13 % with 8 sweeps of 104 members, and by up to 8 % with 16 sweeps (`benchmarks/certainty_cost.py
---seeds 3`)."""
+"""Minimum and maximum number of further sweeps at power 1. A population that the budget makes smaller gets more sweeps,
+so that it provides as many draws as a larger one. For a small path program, the number of sweeps is as large as the
+budget permits. The reference is a posterior from a million draws from the prior (`benchmarks/simulation_based.py
+--reference`). In districts with 300 to 800 interactions, distribution functions after 8, 24 and 48 sweeps differ from
+this reference by 0.053, 0.043 and 0.036. In Auckland, the widths of intervals differ between seeds by up to 13 % with 8
+sweeps of 104 members, and by up to 8 % with 16 sweeps (`benchmarks/certainty_cost.py --seeds 3`)."""
 
 KEPT: Final = 2
 """Number of sweeps at power 1 between two states of a member that are kept as draws."""
@@ -62,13 +60,14 @@ MAX_STEPS: Final = 60
 """Maximum number of steps; the last step raises the power to 1, and most posteriors require 8 to 20 steps."""
 
 APART: Final = 0.2
-"""Independent populations agree if the distribution functions of every parameter differ by at most this distance. Two
-sets of 256 independent draws differ by up to 0.12 in 19 of 20 cases; the members of one population are not quite
+"""Independent populations agree if, for every parameter, their distribution functions differ by at most this distance.
+Two sets of 256 independent draws differ by up to 0.12 in 19 of 20 cases; the members of one population are not quite
 independent."""
 
 APART_BY_CHANCE: Final = 2.0
-"""Factor that sets the limit `APART` for small populations: for halves with n members each, the limit is this factor
-times sqrt(2 / n). For independent draws, a factor of 1.36 would give the 95 % point (Kolmogorov and Smirnov)."""
+"""Factor for the limit that replaces `APART` if populations are small: for halves with n members each, the limit is
+this factor times sqrt(2 / n). For independent draws, a factor of 1.36 would give the 95 % point (Kolmogorov and
+Smirnov)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +82,8 @@ class Posterior:
         spread: Between-building spread of every draw [n].
         model: Index of the noise model of every draw [n].
         replays: Number of evaluations of path loss for the draws.
-        shape: Number of populations, of states per member that are kept as draws, and of members per population.
-        log_evidence: Logarithm of the probability density of the measurements, averaged over the prior.
+        shape: Number of populations, number of states per member kept as draws, and number of members per population.
+        log_evidence: Logarithm of the probability density of the measurements averaged over the prior.
     """
 
     means: Draws
@@ -112,7 +111,7 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
 
 
 def population_size(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
-    """Number of members of each of two populations, for a budget and a number of interactions per evaluation.
+    """Number of members in each of two populations, for a given budget and number of interactions per evaluation.
 
     Draws of several models are pooled with equal weight, so each model requires fewer members.
 
@@ -149,8 +148,7 @@ def draw_posterior(
 
     After every step, `progress` is called with the completed fraction of the work. The budget is the number of
     interactions that may be evaluated. If the draws of several models are pooled, these models share the budget. If
-    populations disagree and are small because of the budget, larger populations are drawn with `largest_budget`
-    instead.
+    populations disagree and the budget makes them small, larger populations are drawn with `largest_budget` instead.
     """
     posterior = _draw_populations(model, seed, progress, budget, models)
     sizes = [population_size(model.interactions, each, models) for each in (budget, largest_budget)]
@@ -208,7 +206,7 @@ def _together(populations: Sequence[Population]) -> Population:
 
 
 def _distance(model: JointModel, populations: list[Population]) -> float:
-    """Largest distance between the distribution functions of any parameter of the study in two populations."""
+    """Largest distance, over the study's parameters, between the distribution functions in two populations."""
     first, second = (each.point[:, : len(model.study)] for each in populations)
     distance = 0.0
     for one, other in zip(first.T, second.T, strict=True):
@@ -250,7 +248,7 @@ def _anneal(
     """
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
-    # Draw noise models uniformly, because the likelihood contains their weights, and both are raised to the same power.
+    # Draw noise models uniformly: the likelihood contains their weights, so both are raised to the same power.
     models = random.integers(0, len(model.marginal.models), size)
     empty = np.zeros(size)
     population = Population(

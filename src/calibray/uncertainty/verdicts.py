@@ -1,9 +1,9 @@
 """Verdicts from draws of the posterior: a credible interval, a verdict and a reason for every parameter.
 
-A credible set is the smallest set that contains a given fraction of the posterior. The set has two pieces if two
-distant ranges fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws (B.
-W. Silverman, Density Estimation for Statistics and Data Analysis, 1986, section 5.2). The kernels are mirrored at the
-bounds.
+A credible set is the smallest set that contains a given fraction of the posterior. The set consists of two intervals if
+two distant ranges fit the data. Gaussian kernels with locally adapted widths smooth the density of the weighted draws
+(B. W. Silverman, Density Estimation for Statistics and Data Analysis, 1986, section 5.2). The kernels are mirrored at
+the bounds.
 
 If the posterior cannot be sampled, linear theory is used instead: intervals and covariances follow from the curvature
 of the sum of squares at the optimum.
@@ -26,7 +26,7 @@ from calibray.uncertainty.draws import Draws, systematic_resampling
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
-    """Intervals by parameter from linear theory in the search space, which is logarithmic for some parameters.
+    """Intervals by parameter, from linear theory in the search space, which is logarithmic for some parameters.
 
     `optimum` is the evaluation at the optimum, with derivatives.
     """
@@ -52,7 +52,7 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
 
 
 def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
-    """Add the reason why the posterior was not sampled to the intervals from linear theory.
+    """Add to the intervals from linear theory the reason why the posterior was not sampled.
 
     Curvature alone does not show other minima or correlated errors, so no parameter is more than weakly identified,
     unless the data contain no noise.
@@ -73,7 +73,7 @@ def linear_intervals(
     upper: NDArray[np.float64],
     freedom: int,
 ) -> list[Interval]:
-    """95 % confidence intervals from the curvature of the sum of squares at the optimum [d], one per parameter.
+    """95 % confidence intervals from the curvature of the sum of squares at the optimum, one for each of d parameters.
 
     A parameter is not identifiable if its interval is wider than half the range between its bounds [d]. Other minima
     and correlated errors can make the true interval wider. The nuisance is eliminated from the residuals [m], [dB], and
@@ -85,7 +85,7 @@ def linear_intervals(
     # Scale the derivatives by the parameters' ranges, which makes the eigenvalues comparable.
     scaled = jacobian * (upper - lower)
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
-    # A direction without effect gets a large but finite variance.
+    # A direction without effect is assigned a large but finite variance.
     values = np.maximum(values, values.max(initial=0.0) * 1e-12 + 1e-300)
     errors = np.sqrt(variance * ((vectors**2) @ (1 / values))) * (upper - lower)
     result = []
@@ -103,7 +103,7 @@ def linear_intervals(
 
 JUDGED: Final = 0.9
 """Probability level of the credible sets on which the verdicts are based. The last few per cent of a 95 % interval can
-lie far from the rest, because of a noise model with a small weight."""
+lie far from the rest if they come from a noise model with a small weight."""
 
 IDENTIFIED: Final = 0.25
 """Maximum width of the credible set of an identified parameter, as a fraction of the range."""
@@ -116,8 +116,8 @@ NO_EFFECT_DB: Final = 1.0
 """Change in path loss over a parameter's range below which a link counts as independent of the parameter [dB]."""
 
 END: Final = 0.1
-"""Maximum distance between an interval's end and the bound, as a fraction of the range, that is attributed to chance if
-no link depends on the parameter."""
+"""If no link depends on a parameter, distances between an interval's end and the bound are attributed to chance up to
+this fraction of the range."""
 
 TRADE_OFF: Final = 0.5
 """Rank correlation above which one parameter is reported to compensate for another."""
@@ -139,7 +139,7 @@ GRID: Final = 101
 """Number of equally spaced points over the whole range that are used in addition to the quantiles."""
 
 STEPS: Final = np.array([0.5, 1.0, 1.5, 2.0, 3.0])
-"""Distances between the outermost quantiles and the points beyond these quantiles, in kernel widths."""
+"""Distances, in kernel widths, from the outermost quantiles to the points beyond them."""
 
 KERNEL_SHARE: Final = 0.08
 """Fraction of the draws within the width of a kernel, for up to 200 draws; more draws allow narrower kernels
@@ -148,24 +148,25 @@ KERNEL_SHARE: Final = 0.08
 MOST_INDEPENDENT: Final = 1000
 """Maximum number of draws that count as independent; further draws are mostly later states of the same members. In four
 districts, 90 % sets then contain 0.88 to 0.90 of a reference posterior. For the constants of window glass, these sets
-have 1.5 pieces on average, and the sets of the reference have 1.1. If all draws counted as independent, the 90 % sets
+have 1.5 pieces on average, compared with 1.1 for the reference. If all draws counted as independent, the 90 % sets
 would contain 0.87 to 0.90 of the reference posterior, and the sets for window glass would have 2.0 pieces
 (`benchmarks/simulation_based.py --reference`)."""
 
 LEAST_SHARE: Final = 0.005
-"""Minimum fraction of the posterior in a piece; smaller fractions are attributed to chance."""
+"""Minimum fraction of the posterior in one piece (interval) of a credible set; smaller fractions are attributed to
+chance."""
 
 REACH: Final = 8.5
 """Number of kernel widths beyond which the tail of a Gaussian is zero in double precision."""
 
 LEAST_GAP: Final = 0.03
 """A gap between pieces is attributed to chance if it is narrower than both this fraction of the range and the wider
-piece. Pieces that all lie within this fraction of the range are merged, because a user would regard the pieces as one
+piece. Pieces that all lie within this fraction of the range are merged, because a user would regard them as one
 value."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Maps points [n, d] to the path loss of the m links used [n, m], [dB]."""
+"""Maps points [n, d] to the path loss [n, m], [dB], of the m links used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +179,7 @@ class Axes:
         upper: Upper bounds [d].
         value: Maps the index of a parameter and a search coordinate to the value that is stated in reasons.
         customary: Usual widths of the parameters' ranges [d]; if None, the widths between the bounds. Fractions refer
-            to the smaller width, so that wider bounds do not improve a verdict.
+            to the smaller of the two widths, so that wider bounds do not improve a verdict.
     """
 
     names: Sequence[str]
@@ -229,9 +230,9 @@ def verdicts(
     level: float = 0.95,
     seen: Draws | None = None,
 ) -> list[JudgedSet]:
-    """Judge every parameter by its posterior or, if buildings differ, by the posterior of the mean over all buildings.
+    """Judge every parameter by its posterior or, if buildings differ, by the posterior of its mean over all buildings.
 
-    The links' errors have the standard deviation `noise_db` [dB]. Intervals cover the fraction `level` of the
+    `noise_db` is the standard deviation of the links' errors [dB]. Intervals cover the fraction `level` of the
     posterior. `seen` is the posterior for the measured buildings; if None, `draws` is used.
     """
     best = draws.point[np.argmax(draws.density)]
@@ -297,7 +298,7 @@ def _bounds_reached(pieces: tuple[tuple[float, float], ...], lower: float, upper
 def _without_chance(
     pieces: tuple[tuple[float, float], ...], lower: float, upper: float
 ) -> tuple[float, float]:
-    """One range for a parameter without effect; gaps between pieces and short distances to a bound are ignored."""
+    """A single range for a parameter without effect; gaps between pieces and short distances to a bound are ignored."""
     low, high, slack = pieces[0][0], pieces[-1][1], END * (upper - lower)
     return lower if low - lower < slack else low, upper if upper - high < slack else high
 
@@ -329,7 +330,7 @@ def _outlying_pieces(
 
 
 def _effect(index: int, modelled: Modelled, best: NDArray[np.float64], axes: Axes) -> float:
-    """Largest change in a link's path loss over the range of a parameter, with the other parameters fixed [dB]."""
+    """Largest change [dB] in a link's path loss over the range of a parameter, with the other parameters fixed."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(axes.lower[index], axes.upper[index], LINE)
     loss = modelled(line)
@@ -356,7 +357,8 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval; if it excludes the calibrated value, an identified verdict is replaced with an ambiguous one."""
+    """The interval; if it excludes the calibrated value, an identified or weakly identified parameter becomes
+    ambiguous."""
     identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
