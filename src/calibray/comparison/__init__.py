@@ -1,1 +1,1 @@
-"""Comparison of methods at equal budgets, and the experiment of the paper."""
+"""Comparison of methods at equal budgets, and the paper's experiment."""

@@ -1,6 +1,6 @@
-"""Comparison of methods at equal budgets: every method runs on one problem with many seeds.
+"""Comparison of methods at equal budgets: every method runs on the same problem with many seeds.
 
-The result is the excess of every method versus the number of RT calls, as arrays, tables, files and a figure.
+The result is the excess of every method as a function of the number of RT calls, as arrays, tables, files and a figure.
 The excess is the best objective so far minus the global optimum on the same data. The optimum is found by least squares
 with many starts, or by another search that reached a lower value.
 """
@@ -75,7 +75,7 @@ class Comparison:
     found_by: str
 
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
-        """Excess of every run [seeds], [dB], after `calls` RT calls.
+        """Excess [seeds], [dB], of every run after `calls` RT calls.
 
         A run that ended earlier keeps its final excess. The excess is +inf before the first evaluation.
         """
@@ -87,7 +87,7 @@ class Comparison:
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
     def calls_to(self, name: str, excess_db: float) -> NDArray[np.float64]:
-        """Number of RT calls after which each run reached an excess [seeds]; +inf for runs that did not reach it."""
+        """Number of RT calls [seeds] after which each run reached an excess; +inf for runs that did not reach it."""
         return np.array([run.first(self.optimum + excess_db) for run in self.runs[name]])
 
     def table(self) -> pd.DataFrame:
@@ -107,7 +107,7 @@ class Comparison:
         ]
 
     def history(self) -> pd.DataFrame:
-        """One row per improvement and one row for the last RT call of a run: method, seed, call, best_db, failure."""
+        """One row per improvement, and one for the last RT call of each run: method, seed, call, best_db, failure."""
         parts = [
             pd.DataFrame(
                 {
@@ -141,7 +141,8 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             column = "end" if calls is None else str(calls)
-            # With a smaller budget, there is no value at this number of calls. 2^62 calls represent the end of the run.
+            # With a smaller budget, there is no value at this number of calls. The end of the run is represented by
+            # 2^62 calls.
             reached = calls is None or method.stops_by_itself or calls <= method.budget
             excess = self.excess(method.name, 2**62 if calls is None else calls)
             for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
@@ -172,14 +173,14 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
 
 
 def table(comparison: Comparison) -> Table:
-    """One row per method: median excesses, and the RT calls and number of runs that reached given excesses."""
+    """One row per method: median excesses, and the RT calls needed to reach given excesses, with the number of runs."""
     records = comparison.table().to_dict("records")
     rows = tuple(_cells({str(key): value for key, value in record.items()}) for record in records)
     return Table("", COLUMNS, rows)
 
 
 def optimum_text(comparison: Comparison) -> str:
-    """A line of text with the optimum and the search that found it."""
+    """A line of text that states the optimum and the search that found it."""
     return f"Optimum {comparison.optimum:.6g} dB, found by {comparison.found_by}"
 
 
@@ -232,7 +233,7 @@ def write(comparison: Comparison, folder: Path) -> None:
 
 @styled()
 def figure(comparison: Comparison) -> Figure:
-    """Excess versus RT calls: the median of each method and the band between its quartiles."""
+    """Excess versus RT calls: the median of each method, and the band between its quartiles."""
     drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
     last = max(method.budget for method in comparison.methods)
     colors = iter(PALETTE * (1 + len(comparison.methods) // len(PALETTE)))
@@ -278,12 +279,12 @@ def compare(
 ) -> Comparison:
     """Run methods with seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
-    Every run is appended to `runs.jsonl` in `out` as soon as it ends. A run is not repeated if the file contains a
+    Every run is appended to `runs.jsonl` in `out` as soon as it ends. A run is skipped if the file contains a
     successful run with the same problem, optimizer code, method, budget and seed.
 
     Args:
-        open_problem: Function that makes the problem. With several workers, it must be picklable, and each worker calls
-            it once.
+        open_problem: Function that makes the problem. With several workers, it must be picklable, and is called once by
+            each worker.
         methods: Methods with their budgets, as returned by `parse_methods`.
         seeds: Number of runs of each method.
         out: Folder in which the runs are stored.
@@ -361,7 +362,7 @@ def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ..
 
 
 def _search_optimum(problem: ComparisonProblem) -> MethodRun:
-    """Run least squares from enough starting points that the result can be regarded as the global optimum."""
+    """Run least squares from so many starting points that the result can be regarded as the global optimum."""
     starts = OPTIMUM_STARTS[problem.large]
 
     def make() -> Optimizer:
@@ -413,7 +414,7 @@ def _finished(
 
 
 def _start(open_problem: OpenProblem) -> None:
-    """Open the problem once for all runs of a worker process, and end this process when its parent process ends."""
+    """Open the problem once for all runs of a worker process, and make the process end when its parent ends."""
     global _opened
     parent = parent_process()
     if parent is not None:

@@ -38,7 +38,7 @@ MAPPING_CALLS: Final = 8
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
     """Run the experiment, with the paper's methods on "replay" (one trace) or "retrace" (one trace per RT call).
 
-    `progress` is called for every stage, with the method's label in front of the name of the stage.
+    `progress` is called for every stage, with the method's label before the stage's name.
 
     Raises:
         InputError: The engine or the seed is invalid.
@@ -163,12 +163,12 @@ class Demo:
         }
 
     def tables(self) -> tuple[Table, ...]:
-        """Cost, permittivities, RMSE, and the intervals and verdicts of `auto`."""
+        """Tables of cost, permittivities and RMSE, and of the intervals and verdicts from `auto`."""
         return cost(self), permittivity(self), accuracy(self), trust(self.results[AUTO])
 
 
 def cost(demo: Demo) -> Table:
-    """RT calls and time of every method, and the values that the paper reports."""
+    """RT calls and time of every method, and the corresponding values from the paper."""
     columns = (
         Column("method"), numbers("RT calls"), numbers("time", "s"),
         numbers("paper: calls"), numbers("paper: time", "s"),
@@ -186,7 +186,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities found by every method, the true values, and the values that the paper reports for its own site."""
+    """Permittivities found by every method, the true values, and the paper's values for its own site."""
     columns = (
         Column("material"),
         Column("before"),

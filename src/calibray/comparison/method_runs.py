@@ -38,11 +38,11 @@ class ComparisonProblem:
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
         start: Starting point given by the user [d]; None if the user gave no starting point.
-        starts: Number of further starting points for methods that use several points; None for the methods' default.
+        starts: Number of further starting points for methods that use several; None for a method's default.
         large: Whether evaluations are too expensive for a reference search with many starts.
         minimum: Lowest objective known in advance; +inf if unknown.
         evaluate: The function to minimize.
-        cheap_model: Function that makes a cheap model of `evaluate`; None if there is no cheap model.
+        cheap_model: Function that makes a cheap model of `evaluate`; None if there is none.
         wrong_constants: Whether the cheap model has wrong constants.
     """
 
@@ -60,7 +60,7 @@ class ComparisonProblem:
 
 
 def study_problem(path: str | Path) -> ComparisonProblem:
-    """Make a problem from a study file and its stored paths, which are traced if the cache does not contain them.
+    """Make a problem from a study file and its paths, which are traced if the cache does not contain them.
 
     Raises:
         InputError: The study cannot be used, or its engine is an external program.
@@ -77,7 +77,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     problem = with_preliminary_fits(Problem.of(setup, engine))
     objective, parameters = problem.objective, problem.parameters
     lower, upper = parameters.search_bounds
-    # Record everything that changes an evaluation: the study without its method, the files, and data derived from both.
+    # Record everything that affects an evaluation: the study without its method, the files, and data derived from both.
     content = {key: section for key, section in problem.setup.study.content().items() if key != "method"}
     record = (
         fingerprint(setup),
@@ -160,7 +160,7 @@ class BudgetedMethod:
         return BudgetedMethod(name, method, budget)
 
     def key(self, seed: int) -> RunKey:
-        """The key of the run with the given seed; its budget is 0 if the method stops by itself."""
+        """The key of the run with the given seed; the key's budget is 0 if the method stops by itself."""
         return self.method, 0 if self.stops_by_itself else self.budget, seed
 
     def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
@@ -210,7 +210,7 @@ class MethodRun:
     failure: str = ""
 
     def at(self, calls: int) -> float:
-        """The best objective after a number of RT calls [dB]; +inf before the first RT call."""
+        """The best objective [dB] after a number of RT calls; +inf before the first RT call."""
         index = bisect_right(self.calls, calls)
         return self.best[index - 1] if index else np.inf
 
@@ -249,7 +249,7 @@ class RunFile:
     everything that determines a run, except for the method, budget and seed.
 
     Raises:
-        InputError: The file contains something other than runs.
+        InputError: The file contains anything other than runs.
     """
 
     def __init__(self, path: Path, problem: str) -> None:

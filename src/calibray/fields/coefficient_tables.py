@@ -53,8 +53,8 @@ _GRAZING: Final = 1e-9
 """Smallest cosine at a node. At exactly 0, even air would be a perfect reflector."""
 
 _EXTRA_NODES: Final = 3
-"""Difference between the numbers of nodes and intervals in a row: there is one more node before the first interval, one
-at the end of the last interval, and one after it."""
+"""Number of nodes of a row minus its number of intervals. The extra nodes are one before the first interval, one at the
+end of the last interval, and one after it."""
 
 _STENCIL: Final = 3
 """Number of nodes that `table_error` requires on each side of a node."""

@@ -58,7 +58,7 @@ class Taps:
     def of(cls, delay: NDArray[np.float64], link: NDArray[np.integer], bandwidth: float) -> Taps:
         """The taps of paths, given their delays [P], [s], their links [P] and the bandwidth [Hz].
 
-        Taps are 1 / bandwidth apart. At the tap spacing used, sampling preserves the power, mean delay and mean square
+        Taps are 1 / bandwidth apart. At this spacing, sampling preserves the power, mean delay and mean square
         delay of the profile, wherever a path lies between two taps.
         """
         # The two taps at or before the path, and the two after it.

@@ -183,8 +183,7 @@ class Moves:
     def _at_points(
         self, population: Population, point: NDArray[np.float64], log_ratio: float | NDArray[np.float64] = 0.0
     ) -> tuple[Population, NDArray[np.bool_]]:
-        """The population after proposing points [n, d + k], and the mask [n] of accepted ones; no replay if out of
-        bounds."""
+        """The population after the points [n, d + k] were proposed, and the mask [n] of the accepted points."""
         inside = np.asarray(((point >= 0.0) & (point <= 1.0)).all(axis=1))
         proposal = self._evaluated_where(inside, population, replace(population, point=point))
         accepted = inside & self._accepts(population, proposal, log_ratio)

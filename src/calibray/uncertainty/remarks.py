@@ -180,8 +180,7 @@ DEPARTURES: Final = {
 
 
 def departures(noise: Mapping[str, float], study: StudyModel) -> tuple[Remark, ...]:
-    """A remark for each noise model whose posterior weight shows that the data favour it over independent Gaussian
-    noise.
+    """A remark for each noise model that, by its posterior weight, the data favour over independent Gaussian noise.
 
     Noise that the study states is not reported. A remark about errors out of sight lists tracer settings that add
     paths.

@@ -3,8 +3,8 @@
 A link's error has a correlated and an uncorrelated part. Nearby receivers share the correlated part, for example
 because clutter that the scene lacks shadows all of them. The covariance of this part falls off exponentially with
 distance. Range and size maximize the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971),
-which prevents the fit of the parameters from biasing the noise estimate downward. The fit is exact, with one Cholesky
-factorization per trial, for up to a few thousand links.
+which prevents the fit of the parameters from biasing the noise estimate downward. For up to a few thousand links, the
+fit is exact, with one Cholesky factorization per trial.
 
 Whitening makes errors independent. For up to a few hundred links, the covariance matrix of the errors is factored. For
 more links, each error is modelled as its conditional mean given the errors of the nearest earlier links, plus an

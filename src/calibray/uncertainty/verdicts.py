@@ -357,8 +357,7 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
 
 
 def consistent(interval: Interval, value: float) -> Interval:
-    """The interval; if it excludes the calibrated value, an identified or weakly identified parameter becomes
-    ambiguous."""
+    """The interval; an identified or weakly identified one that excludes the calibrated value becomes ambiguous."""
     identified = interval.verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED)
     if not identified or interval.contains(value, 1e-9 * abs(value)):
         return interval
