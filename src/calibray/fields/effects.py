@@ -1,4 +1,4 @@
-"""Effects other than material properties, which change the antenna fields of a program's paths.
+"""Effects that change the antenna fields of a program's paths and are not material properties.
 
 An effect has its own parameters. All quantities that depend on the fields (path loss, delay spread, derivatives with
 respect to the materials) are evaluated on the changed program.

@@ -188,7 +188,7 @@ class Objective:
 
     @property
     def fitted(self) -> float:
-        """Effective number of coefficients that the links determine: the sum of the links' shares of each precision.
+        """Effective number of coefficients that the links determine: the sum of the links' shares in their precision.
 
         Coefficients whose priors keep them at zero explain no residuals, regardless of the number of groups.
         """

@@ -76,8 +76,7 @@ class Observed:
         """
         used = self.used(weight)
         gap = modelled[:, used] / self.scale - self.measured[used]
-        # If a candidate leaves a link without a path, the link's residual is 0, and the biases are estimated without
-        # it.
+        # If a link has no path for a candidate, its residual is 0, and it is left out of the estimate of the biases.
         found = np.isfinite(gap)
         gap = np.where(found, gap, 0.0)
         if not self.labels:

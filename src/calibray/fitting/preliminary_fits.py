@@ -264,7 +264,7 @@ class GroupSpread(NamedTuple):
 
     Attributes:
         between: Standard deviation between groups, in the unit of the residuals per unit of the column; 0 if the groups
-            do not differ, `UNKNOWN_DB` if the links do not determine it.
+            do not differ, and `UNKNOWN_DB` if the links do not determine this value.
         within: Standard deviation of individual links within a group, in the unit of the residuals.
     """
 

@@ -108,7 +108,7 @@ def understand(
 ) -> Understanding:
     """Find the assumptions that explain the ratios of all calls.
 
-    If `before` (the assumptions found from the earlier calls) is given, the search starts from it. The
+    If `before` is given (the assumptions found from the earlier calls), the search starts from it. The
     model contains the paths of the last call. `known` is true if the program's antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)

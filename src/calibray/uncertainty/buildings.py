@@ -155,7 +155,7 @@ class SplitChunks(Split):
 
 @dataclass(frozen=True)
 class _Splitting:
-    """Settings for splitting replays, which can be pickled. Equal settings split a replay in the same way.
+    """Picklable settings for splitting replays. Equal settings split a replay in the same way.
 
     Attributes:
         parameters: The study's parameters and further constants.

@@ -44,7 +44,9 @@ class _Terms(NamedTuple):
 def log_survival(error: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
     """Log probability that a Student's t variable exceeds an error; a Gaussian variable if `freedom` is infinite.
 
-    Example: >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist() [-0.69, -804.61]
+    Example:
+        >>> log_survival(np.array([0.0, 40.0]), np.inf).round(2).tolist()
+        [-0.69, -804.61]
     """
     return log_ndtr(-error) if np.isinf(freedom) else np.log(np.maximum(stdtr(freedom, -error), 1e-300))
 
@@ -206,7 +208,7 @@ class Tail(NamedTuple):
         size: Fisher information of an error about the logarithm of its scale; a number or an array [n].
         by_weights: Whether to update the scale with the sum of the weights instead of the number of links, which
             converges faster.
-        select: The distributions for the gaps with the given indices.
+        select: Function that returns the distributions for the gaps with given indices.
     """
 
     log_density: OfSquare

@@ -109,7 +109,7 @@ LEVELS: Final = (5.0, 15.0, 25.0)
 districts with twins that lack refraction, the missing power is 2 to 35 dB below the power in sight."""
 
 COMMON: Final = 0.5
-"""Fraction of the variance of errors out of sight that all links share; there is a shared part because missing paths
+"""Fraction of the variance of errors out of sight that all links share. Errors have a shared part because missing paths
 can only add power."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
