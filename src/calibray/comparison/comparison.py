@@ -158,7 +158,7 @@ class Comparison:
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile of values [n], by linear interpolation; +inf if the interpolation involves an infinite value.
+    """A quantile of values [n] by linear interpolation; +inf if the interpolation involves an infinite value.
 
     Example:
         >>> import numpy as np

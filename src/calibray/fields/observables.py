@@ -45,7 +45,7 @@ class Taps:
     Attributes:
         delay: Delay of every tap [T], [s].
         link: Link of every tap [T].
-        index: Indices of the taps of every path [P, TAPS].
+        index: Indices [P, TAPS] of the taps of every path.
         share: Share [P, TAPS] of the path's power in each of these taps.
     """
 

@@ -84,7 +84,7 @@ class FormulaArguments:
         transmitted: Whether each coefficient is a transmission coefficient [K].
         unreduced: Whether the coefficient is a reflection coefficient that scattering does not reduce, as in a diffuse
             interaction [K].
-        blank: Whether the position is empty and its coefficient is 1 [K]; None if no position is empty.
+        blank: Whether each position is empty, so that its coefficient is 1 [K]; None if no position is empty.
         shapes: Shape of the positions at each step of each group, (n,) or (k, n).
         lines: Number of stored positions in each line (one line, or k for a run) of each step; the last line is stored
             first.

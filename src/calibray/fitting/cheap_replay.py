@@ -74,7 +74,7 @@ class StoredPaths(Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss [n, L], [dB], and its derivatives with respect to the parameters [n, L, d]."""
+        """Path loss [n, L], [dB], and its derivatives [n, L, d] with respect to the parameters."""
         ...
 
 

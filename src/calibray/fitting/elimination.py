@@ -59,8 +59,8 @@ class Elimination:
     """Normal equations of a nuisance over weighted links.
 
     Attributes:
-        design: Columns Z of the nuisance at the m links with nonzero weight [m, q].
-        weighted: Z' W, with the diagonal matrix W of the weights [q, m].
+        design: Columns Z [m, q] of the nuisance at the m links with nonzero weight.
+        weighted: Z' W [q, m], with the diagonal matrix W of the weights.
         data: Z' W Z, the normal equations without priors [q, q].
         normal: The normal equations with priors; `order` states the order of their columns.
         order: Index, in the design, of each column of `normal` [q].
@@ -83,9 +83,9 @@ class Elimination:
 
     @classmethod
     def of(cls, nuisance: Nuisance, weight: NDArray[np.float64], ridge: NDArray[np.float64]) -> Elimination:
-        """Set up the normal equations with the weights of all links [L]; a weight of 0 leaves a link out.
+        """Set up the normal equations with the weights [L] of all links; a weight of 0 leaves a link out.
 
-        `ridge` is the square root of the priors' contribution to the diagonal of these equations [q].
+        `ridge` [q] is the square root of the priors' contribution to the diagonal of these equations.
         """
         counted = weight > 0
         design = nuisance.design if counted.all() else nuisance.design[counted]
@@ -174,11 +174,11 @@ class Arrowhead:
     """The matrix N of the quadratic form x.N.x / 2 - side.x, scaled to a unit diagonal, with q = g b + p rows.
 
     Attributes:
-        scale: Square roots of the diagonal before scaling; 1 where the diagonal is 0 [q].
+        scale: Square roots [q] of the diagonal before scaling; 1 where the diagonal is 0.
         blocks: The g diagonal blocks [g, b, b].
-        border: Products of the block columns with the p border columns [g, b, p].
-        corner: Products of the border columns with each other [p, p].
-        dependent: Mask of the components whose column is zero or a linear combination of the preceding columns [q]; the
+        border: Products [g, b, p] of the block columns with the p border columns.
+        corner: Products [p, p] of the border columns with each other.
+        dependent: Mask [q] of the components whose column is zero or a linear combination of the preceding columns; the
             blocks precede the border. The matrix includes a small prior on these components. These components are
             therefore zero unless the bounds prevent the other components from reaching the minimum.
     """

@@ -31,10 +31,10 @@ UNKNOWN_DB: Final = 10.0
 large because a single group contains no information about the spread."""
 
 START_SPREAD: Final = 6.0
-"""Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
+"""Standard deviation [dB per unit of the column] between the groups of a random effect before it is estimated."""
 
 ROUNDING: Final = 1e-9
-"""Maximum difference between distances that is attributed to rounding [decades]."""
+"""Maximum difference [decades] between distances that is attributed to rounding."""
 
 UNBOUNDED: Final = (-np.inf, np.inf)
 

@@ -41,7 +41,7 @@ class Sums:
     """Sums over links, for n candidates and k columns: first the derivatives, if requested, and then the gap.
 
     Attributes:
-        square: Products A'wA of the columns [n, k, k]; the squared gap is infinite if any link lacks a path.
+        square: Products A'wA [n, k, k] of the columns; the squared gap is infinite if any link lacks a path.
         side: Products with the design Z'wA [n, q, k].
     """
 
@@ -58,8 +58,8 @@ class Share:
         links: Indices, within the chunk, of the m links with nonzero weight [m].
         measured: Their measured path loss [m], [dB].
         weight: Weights of these links, normalized as in the objective [m].
-        design: The c columns of the nuisance with entries at these links [m, c].
-        columns: Indices of these columns in the nuisance [c].
+        design: The c columns [m, c] of the nuisance with entries at these links.
+        columns: Indices [c] of these columns in the nuisance.
         ceiling_db: Path loss assigned to a link without a path [dB]; None if there is no ceiling.
     """
 
@@ -73,7 +73,7 @@ class Share:
     def __call__(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64] | None = None) -> Sums:
         """Sums over the links of the chunk, from path loss [n, l], [dB], and its derivatives [n, l, d].
 
-        `side` contains only the columns of the chunk [n, c, k].
+        `side` [n, c, k] contains only the columns of the chunk.
         """
         loss = path_loss[:, self.links]
         at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
@@ -361,7 +361,7 @@ def make_objective(
 
     Args:
         links: All links.
-        reached: Mask of the links with a path [L].
+        reached: Mask [L] of the links with a path.
         calibrated: Mask of the calibration links [L].
         nuisance: The nuisance over all links; None if the model has no nuisance.
         ceiling_db: Path loss assigned to a link without a path [dB]; if None, these links are left out.

@@ -199,7 +199,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 
 
 def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
-    """Estimate the spreads of a problem's random effects, at a point of the search space [d].
+    """Estimate the spreads of a problem's random effects at a point [d] of the search space.
 
     The first result is the problem with these spreads. The second result is the standard deviation of a link's error
     within the groups of the last effect [dB]. If the engine provides no derivatives, both results are estimated at the

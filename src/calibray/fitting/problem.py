@@ -35,8 +35,8 @@ class Evaluation(NamedTuple):
 
     Attributes:
         value: The objective, including priors [n].
-        residuals: Weighted residuals, followed by one row per prior [n, m].
-        jacobian: Derivatives of the residuals with respect to the search coordinates [n, m, d]; None if not requested.
+        residuals: Weighted residuals [n, m], followed by one row per prior.
+        jacobian: Derivatives [n, m, d] of the residuals with respect to the search coordinates; None if not requested.
         modelled: The engine's values [n, L]; [n, 0] if the engine returned only sums.
         rmse_db: The RMSE of the links only (paper eq. 1) [n].
         represents: Number of full residuals that the m compressed residuals represent; both have the same mean squares
@@ -59,7 +59,7 @@ class Evaluation(NamedTuple):
 
     @property
     def curvature(self) -> NDArray[np.float64]:
-        """Products J'J of the derivatives, summed over all full residuals [n, d, d]."""
+        """Products J'J [n, d, d] of the derivatives, summed over all full residuals."""
         slopes = self.slopes
         return np.einsum("nmi,nmj->nij", slopes, slopes) * (self.num_rows / slopes.shape[1])
 
@@ -174,7 +174,7 @@ class Problem:
         return isinstance(self.engine, Differentiable) and self.observable.derivatives is not None
 
     def evaluate(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """Run the engine on points of the search space [n, d]."""
+        """Run the engine on points [n, d] of the search space."""
         return self.evaluate_candidates(self.parameters.from_search(points), derivatives)
 
     def evaluate_candidates(self, candidates: NDArray[np.float64], derivatives: bool = False) -> Evaluation:

@@ -53,7 +53,7 @@ PROMISING: Final = 3.0
 are kept."""
 
 MOST_HOPS: Final = 30
-"""Maximum change of a thickness in a trial [half wavelengths in the slab]."""
+"""Maximum change in thickness [half wavelengths in the slab] in a trial."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class Ratio(NamedTuple):
 
     Attributes:
         call: The earlier call.
-        here: Indices of the paths in the last call, in ascending order [n].
+        here: Indices [n] of the paths in the last call, in ascending order.
         weight: Weights of the paths [n]; the sum over all ratios is 1.
         level_db: Power in the last call [n], [dB].
         observed: Power in the last call relative to the power in the earlier call [n], [dB].

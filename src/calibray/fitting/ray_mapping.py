@@ -95,7 +95,7 @@ class RayMap:
             path.
         lost: Number of links that lose all their paths, or that have no path in the replay at the best call.
         half_spaces: Materials whose thickness the calls do not determine.
-        minima: Minima of the replay that replaces the engine, lowest first, as points of the search space [k, d].
+        minima: Minima of the replay that replaces the engine, as points [k, d] of the search space, lowest first.
         remaining_db: Objective of this replay at the best call minus the objective at the lowest of these minima [dB].
         moved_db: RMS difference, over the links, between the replay's path loss at the lowest minimum and at the best
             call [dB].

@@ -136,7 +136,7 @@ class RayModel:
         return np.minimum(lower, self.start), np.maximum(upper, self.start)
 
     def tables(self, candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Constants of the materials [n, M, 8] for n candidates, each [d]."""
+        """Constants [n, M, 8] of the materials for n candidates, each [d]."""
         return np.stack([self.paths.material_table(self.materials(each)) for each in candidates])
 
     def levels_and_slopes(
@@ -242,10 +242,10 @@ class RayModel:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Polarized:
-    """Polarization of antennas with the ports V and H; its parameters are the slant and two tilts of each end [rad].
+    """Polarization of antennas with the ports V and H; its parameters are the slant and two tilts [rad] at each end.
 
     Attributes:
-        tx: Unit vectors theta and phi of the fields at the transmitter [P, 2, 3].
+        tx: Unit vectors theta and phi [P, 2, 3] of the fields at the transmitter.
         rx: The same at the receiver.
         linear: Whether the antenna at each end is linearly polarized [2]; otherwise the antenna receives both
             components.
@@ -291,7 +291,7 @@ def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
 
 
 def ports(basis: Any, angles: Any, xp: Any = np) -> Any:
-    """Weights of the ports V and H in a linear polarization and in the orthogonal one [P, 2, 2].
+    """Weights [P, 2, 2] of the ports V and H in a linear polarization and in the orthogonal one.
 
     Args:
         basis: Unit vectors theta and phi of the fields [P, 2, 3].

@@ -101,7 +101,7 @@ class Scan:
 
     Attributes:
         values: Logarithms of the scanned constants [H, K, c].
-        misfit: Mean loss of the ratios [H, K]; infinite if a pair of polarizations has fewer than K minima.
+        misfit: Mean loss [H, K] of the ratios; infinite if a pair of polarizations has fewer than K minima.
     """
 
     values: NDArray[np.float64]
@@ -200,7 +200,7 @@ class _Scanned(NamedTuple):
         here: Whether an interaction is on the scanned material [D, P].
         cosine: Cosine of the angle of incidence [D, P].
         through: Whether the interaction is a transmission [D, P].
-        rotation: Cosine and sine of the rotation into the frame of incidence [D, 2, P].
+        rotation: Cosine and sine [D, 2, P] of the rotation into the frame of incidence.
         constants: Permittivity, conductivity and thickness at every call, last call first [C + 1, 3, D, P].
         tx: Fields at the transmitter [T, 2, P].
         rx: Conjugate fields at the receiver [R, 2, P].
@@ -311,7 +311,7 @@ class Gains(NamedTuple):
     Attributes:
         last: Gains at the last call [n, R, T].
         earlier: Gains at an earlier call [n, R, T].
-        bases: Unit vectors theta and phi of the fields at both ends [n, 2, 3].
+        bases: Unit vectors theta and phi [n, 2, 3] of the fields at both ends.
         weight: Weights of the paths [n].
         observed: Power at the last call relative to that at the earlier one [n], [dB].
     """

@@ -107,7 +107,7 @@ def local_searches(interactions: int) -> int:
 
 
 Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
-"""Evaluates points of the search space [n, d]; the flag requests derivatives."""
+"""Evaluates points [n, d] of the search space; the flag requests derivatives."""
 
 SEARCHES: Final = 64
 """Number of local searches for further minima if the method kept only its best minimum."""
@@ -160,7 +160,7 @@ class Trail:
         best_modelled: The engine's values for the best candidate [L].
         best_rmse_db: RMSE of the best candidate [dB].
         best_value: Objective of the best candidate, including priors [dB].
-        minima: Minima of the optimizer's searches, best first, as points of the search space [k, d].
+        minima: Minima of the optimizer's searches, as points [k, d] of the search space, best first.
         rt_calls: Number of RT calls of the search, including those answered from the ledger of an earlier run.
         ledger_hits: Number of calls that are answered from the ledger.
         modelled: The engine's values [L] for each candidate; only for an engine without derivatives.

@@ -80,8 +80,8 @@ class Split(ABC):
     """A replay whose candidates set further constants in addition to the study's parameters.
 
     Attributes:
-        parameter_of: Index of the parameter to which each of c constants belongs, in ascending order [c].
-        building_of: Index of each constant's building; -1 for other objects, such as the ground [c].
+        parameter_of: Index [c] of the parameter to which each of the c constants belongs, in ascending order.
+        building_of: Index [c] of each constant's building; -1 for other objects, such as the ground.
         met: Indices of the buildings with which the paths interact.
         interactions: Number of interactions evaluated per candidate.
     """
@@ -93,7 +93,7 @@ class Split(ABC):
 
     @property
     def keys(self) -> NDArray[np.int64]:
-        """Numbers that encode the parameter and the building of each constant, in ascending order [c]."""
+        """Numbers [c] that encode the parameter and the building of each constant, in ascending order."""
         # Building -1 comes just before building 0 of the same parameter.
         return (self.parameter_of << 32) + self.building_of
 
@@ -319,7 +319,7 @@ def _chunk_respond(
 
 
 def _interaction_buildings(paths: Paths, scene: Scene) -> NDArray[np.int64]:
-    """Building of every interaction [I]; -1 for an interaction with a ground material."""
+    """Building [I] of every interaction; -1 for an interaction with a ground material."""
     triangles = read_triangles(scene)
     ground_names = [list(scene.materials)[k] for k in np.unique(triangles.material[triangles.ground])]
     building = building_numbers(triangles, np.asarray(paths.vertex, dtype=np.float64))

@@ -15,8 +15,8 @@ class Draws:
 
     Attributes:
         point: The points [n, d].
-        density: Log posterior density at the points, up to a constant [n].
-        weight: Weights of the points, which sum to one [n].
+        density: Log posterior density [n] at the points, up to a constant.
+        weight: Weights [n] of the points, which sum to one.
         agree: Whether the independent populations of the sampler agree.
     """
 

@@ -151,7 +151,7 @@ class Calls(NamedTuple):
 
     Attributes:
         unit: Distinct points in the unit cube [n, d].
-        rows: Emulated rows at the points, as in `ResponseRows` [n, m].
+        rows: Emulated rows [n, m] at the points, as in `ResponseRows`.
         value: Objective [n].
     """
 

@@ -135,8 +135,8 @@ class JointModel:
         gaps: Computes the gaps, measured minus modelled path loss; see `Gaps`.
         loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
-        parameter_of: Index of the parameter to which each of the c constants of individual buildings belongs [c].
-        building_of: Index of the building of each of these constants [c].
+        parameter_of: Index [c] of the parameter to which each of the c constants of individual buildings belongs.
+        building_of: Index [c] of the building to which each of these constants belongs.
         only_buildings: Indices of the parameters whose constants all belong to buildings, so that these parameters
             affect path loss only through the buildings' constants.
         spread: The between-building spread if the study declares it; otherwise None.
@@ -203,7 +203,7 @@ class JointModel:
         return np.logaddexp.reduce(self.densities_by_model(gaps), axis=1) + self.log_prior(unit)
 
     def log_prior(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Logarithm of the prior density over the unit cube [n, d + k], up to a constant [n]."""
+        """Logarithm [n] of the prior density at points of the unit cube [n, d + k], up to a constant."""
         if not len(self.priors):
             return np.zeros(len(points))
         values = self.parameters.from_unit(points)
@@ -231,7 +231,7 @@ class JointModel:
         return points
 
     def draw_spread(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
-        """Draw between-building spreads from their prior, with 0 for equal buildings [count]."""
+        """Draw between-building spreads [count] from their prior, with 0 for equal buildings."""
         if self.spread is not None or not len(self.parameter_of):
             return np.full(count, self.spread or 0.0)
         differing = np.clip(random.exponential(MEAN_SPREAD, count), *SPREAD_BOUNDS)
@@ -425,7 +425,7 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
 
 
 def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Weights of the links in the likelihood [L], and the mask of the censored links [L].
+    """Weights [L] of the links in the likelihood, and the mask [L] of the censored links.
 
     If the likelihood contains censored links, it also contains the links measured near the noise floor, because
     otherwise links would be selected by their measured values.

@@ -65,7 +65,7 @@ def log_evidence(
             [n, m], [dB]; -inf for a censored link without a modelled path.
         censored: Mask of the censored links [m].
         design: Columns of the nuisance [m, q].
-        ridge: Inverse standard deviations of the coefficients' priors [q]; 0 for a flat prior.
+        ridge: Inverse standard deviations [q] of the coefficients' priors; 0 for a flat prior.
         freedom: Degrees of freedom of Student's t; +inf for a Gaussian.
 
     Returns:

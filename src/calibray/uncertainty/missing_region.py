@@ -42,7 +42,7 @@ class Explained(NamedTuple):
     Attributes:
         explained: Sum of squares that the rectangle explains.
         attenuation: Its attenuation [dB/m].
-        cells: South-west and north-east corners of the rectangle, in cells [2, 2].
+        cells: South-west and north-east corners [2, 2] of the rectangle, in cells.
         chance: Sum of squares [k - 1] that the best rectangle of this width explains for each permutation.
     """
 

@@ -55,8 +55,8 @@ class Population:
         spread: Between-building spread [n].
         model: Index of the noise model [n].
         gap: Weighted difference between measured and modelled path loss [n, m], [dB].
-        log_likelihood: Log density of the links under the noise model [n].
-        log_prior: Log prior density of the point [n].
+        log_likelihood: Log density [n] of the links under the noise model.
+        log_prior: Log prior density [n] of the points.
     """
 
     point: NDArray[np.float64]

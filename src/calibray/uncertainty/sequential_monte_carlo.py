@@ -79,8 +79,8 @@ class Posterior:
         seen: The same draws for the buildings with which the paths interact: the geometric means of the constants of
             these buildings.
         joint: Points of the unit cube of all parameters [n, d + k].
-        spread: Between-building spread of every draw [n].
-        model: Index of the noise model of every draw [n].
+        spread: Between-building spread [n] of every draw.
+        model: Index [n] of the noise model of every draw.
         replays: Number of evaluations of path loss for the draws.
         shape: Number of populations, number of states per member kept as draws, and number of members per population.
         log_evidence: Logarithm of the probability density of the measurements averaged over the prior.

@@ -178,7 +178,7 @@ class Axes:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         value: Maps the index of a parameter and a search coordinate to the value that is stated in reasons.
-        customary: Usual widths of the parameters' ranges [d]; if None, the widths between the bounds. Fractions refer
+        customary: Usual widths [d] of the parameters' ranges; if None, the widths between the bounds. Fractions refer
             to the smaller of the two widths, so that wider bounds do not improve a verdict.
     """
 
