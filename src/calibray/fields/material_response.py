@@ -98,7 +98,7 @@ def response_and_derivatives(
 
 
 def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse) -> MaterialResponse:
-    """Derivatives with respect to conductivity; to save a pass, they follow from those with respect to permittivity.
+    """Derivatives with respect to conductivity, computed from those with respect to permittivity to save a pass.
 
     Coefficients are analytic in eta = eps_r - j loss, and the loss is proportional to the conductivity. The derivative
     with respect to the conductivity is therefore -j times the loss per unit of conductivity times the derivative with

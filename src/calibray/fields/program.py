@@ -48,14 +48,14 @@ class Group:
     """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
 
     Attributes:
-        tx: Transmit field, real and imaginary part [2, T, 2, n]; only the real part [1, T, 2, n] if all fields are
+        tx: Transmit field, real and imaginary parts [2, T, 2, n]; only the real part [1, T, 2, n] if all fields are
             real.
         rx: Receive field times A lambda / 4 pi, in the same form [2 or 1, R, 2, n].
         rotation: For each step, (cos, sin) of the rotation into the interaction's frame [2, n]; [k, 2, n] for a run of
             k.
         turn: For each diffuse step, (cos, sin) of the rotation from the frame of incidence into the basis (theta, phi)
             [2, n]; None for other steps.
-        wedge: For each diffraction step, the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n]; None for
+        wedge: For each diffraction step, the matrices C_0 .. C_4, real and imaginary parts [2, 5, 2, 2, n]; None for
             other steps.
         signature: One letter for each step; see `calibray.fields.grouping`.
         size: Number of paths n.

@@ -1,7 +1,8 @@
 """Geometry of traced paths: computes the constants of the path program from vertices and normals.
 
-The field of a path is a Jones vector. Each interaction defines a frame for the Jones vector. The first axis of the
-frame is s = k x n / |k x n| (transverse electric), and the second axis is k x s. Between interactions, Sionna RT
+The field of a path is a Jones vector. Each interaction defines a frame for the Jones vector. At a surface with normal
+n, the first axis of the frame is s = k x n / |k x n| (transverse electric), and the second axis is k x s. At an edge
+that diffracts, the frame is fixed to the edge. Between interactions, Sionna RT
 expresses the field in the basis (theta, phi) of the direction of travel. This module combines two rotations: from the
 frame of one interaction into the basis (theta, phi), and from this basis into the frame of the next interaction. All
 conventions are those of Sionna RT, so path gains agree with those of Sionna RT, including the phase. These conventions

@@ -148,7 +148,7 @@ class StudyModel(StudyContent, ABC):
 
     @property
     def observable_paths(self) -> dict[str, Path]:
-        """The files of the observables that are computed from files, by observable name."""
+        """The files from which observables are computed, keyed by the name of the observable."""
         return {
             name: self._resolve(f"observables.{name}.file", section.file)
             for name, section in self.observables.items()

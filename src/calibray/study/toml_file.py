@@ -167,8 +167,8 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
     A study can use replay and also state the command of a program, which `calibray run --engine command` then calls.
 
     Raises:
-        InputError: The value of a key of another engine is invalid, or several engines share the key and only an engine
-            that the table does not describe accepts the value.
+        InputError: A key of another engine has an invalid value, or a key shared by several engines has a value that is
+            valid only for engines that the table does not describe.
     """
     # The validation of the study rejects a value that is not a table or does not name an engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None

@@ -84,7 +84,7 @@ def dress(axes: Axes, x: str, y: str) -> None:
 
 
 def plain_number(value: float) -> str:
-    """Format a number without an exponent, such as 1,000,000 or 0.00001."""
+    """Format a number without an exponent, for example as 1,000,000 or 0.00001."""
     return f"{value:,.12f}".rstrip("0").rstrip(".")
 
 

@@ -71,7 +71,7 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
 def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
     """Whether a claim of another run is still valid.
 
-    A claim is invalid if its process has ended or has not renewed the claim for the duration `EXPIRY`. `expires` and
+    A claim is invalid if its process has ended, or has not renewed it for longer than `EXPIRY`. `expires` and
     `now` are times [s since 1970] by the clocks of the claim's machine and of this machine, respectively.
     """
     # A clock may be wrong by up to `SKEW`. If a claim's expiry is further than this from the present time, the claim is

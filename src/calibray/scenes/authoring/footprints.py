@@ -300,7 +300,7 @@ class FootprintColumns:
     """Columns of a vector file other than the column of building heights.
 
     Attributes:
-        bottom: Column with the bottom height of each building [m], or one height for all buildings.
+        bottom: Column with the height of each building's base [m], or one base height for all buildings.
         name: Column with the names of buildings; buildings without a name are numbered.
         levels: Column with the number of storeys, for buildings without a height.
     """
