@@ -235,8 +235,11 @@ def _meant(name: str, absent: set[str]) -> str | None:
 def _kinds(
     table: SourceTable, row_path: NDArray[np.int64], step: NDArray[np.int64], count: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Kind of every row [rows]; 0 at the ends of a path. Refuses unknown types, and paths that do not start at a
-    transmitter and end at a receiver."""
+    """Kind of every row [rows]; 0 at the ends of a path.
+
+    Raises:
+        InputError: A type is unknown, or a path does not start at a transmitter and end at a receiver.
+    """
     stated = table.labels("type")
     kinds = np.char.lower(np.char.strip(stated))
     known = [*ENDS, *TYPES]
