@@ -185,8 +185,7 @@ class Obstruction:
     other_floor: NDArray[np.bool_]
 
     def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
-        """The columns listed in `OBSTACLES` [n], keyed by name, for a common wavelength [m] or one wavelength per link
-        [n]."""
+        """The columns listed in `OBSTACLES` [n], keyed by name, for one wavelength [m], or one for each link [n]."""
         values = (self.out_of_sight, self.walls, self.length_m, self.knife_edge_db(wavelength))
         return {name: value.astype(np.float64) for name, value in zip(OBSTACLES, values, strict=True)}
 

@@ -85,7 +85,7 @@ def fit_correlation(
 ) -> Correlation:
     """Fit the range and size of the correlated part of the errors by restricted maximum likelihood.
 
-    The positions [m, k] are those of the receivers or of both ends, in metres. The columns of `design` [m, q], which has
+    Positions [m, k] are those of the receivers or both ends, in metres. The columns of `design` [m, q], which has
     full rank, were fitted to the same links: nuisances, and derivatives with respect to the parameters.
 
     Raises:
@@ -170,7 +170,7 @@ def variogram(
     """Empirical variogram: half the mean squared difference between errors, as a function of link distance.
 
     A rising variogram indicates correlated errors, and a flat variogram indicates independent errors. Errors [m] are in
-    dB. The positions [m, k] are those of the receivers or of both ends, in metres. The result is the mean distance [8], [m],
+    dB. Positions [m, k] are those of the receivers or both ends, in metres. The result is the mean distance [8], [m],
     the semivariance [8], [dB^2], and the number of pairs [8], for distance classes with about the same number of pairs.
     With fewer than 8 pairs, there are fewer than 8 classes.
     """
