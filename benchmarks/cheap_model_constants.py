@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from calibray.optimizers.arguments import Box
 from calibray.optimizers.multifidelity.correction import UnitModel, correct, misfit, with_discrepancy
 from calibray.optimizers.sampling import design
+from calibray.paths import Kind, Paths
 from cheap_model_errors import optimum, print_table
 from problem_families.family import PlantedProblem, problem
 from problem_families.problems import cheap_model
@@ -42,7 +43,15 @@ def true_constants(planted: PlantedProblem, model: UnitModel) -> NDArray[np.floa
     materials = planted.engine.paths.materials
     values = [getattr(materials[item.material], item.constant) for item in parameters][count:]
     searched = parameters.to_search(np.concatenate([parameters.start[:count], values]))[count:]
-    return np.clip(searched, model.constants.lower, model.constants.upper)
+    gains = [0.0 if _found(planted, layer) else -np.inf for layer in planted.further]
+    return np.clip([*searched, *gains], model.constants.lower, model.constants.upper)
+
+
+def _found(planted: PlantedProblem, layer: Paths) -> bool:
+    """Whether the engine finds the paths of a layer."""
+    if (layer.kind == Kind.DIFFRACTION).any():
+        return planted.differences.diffraction
+    return bool(np.diff(layer.first).max() <= planted.differences.depth[0])
 
 
 def rows(kind: str, seed: int) -> None:
