@@ -181,8 +181,11 @@ class Richer(Calls):
         return self.replay.path_loss(candidates)
 
 
-def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(asked, model, richer):
-    gain = []
+def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(asked, richer, layers):
+    layered = Replay(
+        with_layers(asked.setup.trace(), layers), with_constants(asked.parameters, richer.materials)
+    )
+    model, gain = ReplayedModel(layered, 3, ProblemRows(asked), len(layers)), []
     for paths in (richer, asked.setup.trace()):
         engine = replace(asked, engine=Richer(paths, asked.parameters))
         optimizer = choose(engine, model)
