@@ -343,7 +343,7 @@ def further_layers(paths: Paths, max_depth: int, diffraction: bool) -> tuple[Pat
     """The paths that a trace of at most `max_depth` interactions, with or without diffraction, leaves out.
 
     There are up to three layers: paths with one interaction more than `max_depth`, paths with at least two more, and
-        paths with diffraction if the trace excludes diffraction. Weak paths and empty layers are left out.
+    paths with diffraction if the trace excludes diffraction. Weak paths and empty layers are left out.
     """
     interactions, power = np.diff(paths.first), powers(paths)
     strong = power >= WEAK * np.bincount(paths.link, power, paths.num_links)[paths.link]

@@ -194,8 +194,8 @@ def map_rays(
 
     The result contains the replay that replaces the engine, and the accuracy of this replay. Calls also continue if the
     minimum of the replay is not at the best call: an accurate prediction over a short step does not show that the model
-        is accurate elsewhere. Calling stops if links lose all their paths in two successive calls at minima. The engine
-        is called through `ask`, never through `problem`.
+    is accurate elsewhere. Calling stops if links lose all their paths in two successive calls at minima. The engine is
+    called through `ask`, never through `problem`.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
     understanding: Understanding | None = None

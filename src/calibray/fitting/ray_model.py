@@ -284,7 +284,7 @@ def tilted_theta(basis: Any, axis: Any, xp: Any = np) -> Any:
     """Unit vector theta of antennas with axes [..., 3], as components [..., P, 2] along the field vectors [P, 2, 3].
 
     The vector theta points away from the pole: it is the component of -axis orthogonal to the direction, scaled to unit
-        length.
+    length.
     """
     theta = -xp.einsum("pac,...c->...pa", basis, axis)
     return theta / xp.sqrt(xp.maximum(xp.sum(theta**2, axis=-1, keepdims=True), 1e-12))
