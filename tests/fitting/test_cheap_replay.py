@@ -94,22 +94,27 @@ def test_the_replay_leads_to_the_optimum_in_a_few_calls(asked, model):
     assert min(values) < 1.01 * asked.evaluate(best.best.x[None]).value[0]
 
 
-def test_derivatives_of_the_cheap_model_agree_with_its_residuals(asked, model):
-    given = model.constants
+def check_derivatives(asked: Problem, model: ReplayedModel) -> None:
+    """Compare the derivatives of a cheap model's residuals with central differences."""
     point = asked.parameters.to_search(asked.parameters.start)[None] + 0.3
-    told = model.answer(point, given.centre[None] + 0.1)
-    assert told.residuals == pytest.approx(model.residuals(point, given.centre[None] + 0.1))
-    assert told.residuals.shape[1] == len(model.known) == planted.LINKS + 3
-    assert model.known.sum() == planted.LINKS
-    size = len(given.centre)
+    constants = model.constants.centre[None] + 0.1
+    answer, size = model.answer(point, constants), constants.shape[1]
+    assert answer.residuals == pytest.approx(model.residuals(point, constants))
     for k in range(3 + size):
         move = 1e-5 * np.eye(3 + size)[k]
-        there, here = (
-            model.residuals(point + sign * move[:3], given.centre[None] + 0.1 + sign * move[3:])
-            for sign in (1, -1)
+        above, below = (
+            model.residuals(point + sign * move[:3], constants + sign * move[3:]) for sign in (1, -1)
         )
-        slope = told.by_point[0, :, k] if k < 3 else told.by_constant[0, :, k - 3]
-        assert slope == pytest.approx((there - here)[0] / 2e-5, rel=1e-3, abs=1e-4)
+        slope = answer.by_point[0, :, k] if k < 3 else answer.by_constant[0, :, k - 3]
+        assert slope == pytest.approx((above - below)[0] / 2e-5, rel=1e-3, abs=1e-4)
+
+
+def test_derivatives_of_the_cheap_model_agree_with_its_residuals(asked, model):
+    check_derivatives(asked, model)
+    point = asked.parameters.to_search(asked.parameters.start)[None]
+    answer = model.answer(point, model.constants.centre[None])
+    assert answer.residuals.shape[1] == len(model.known) == planted.LINKS + 3
+    assert model.known.sum() == planted.LINKS
 
 
 @pytest.fixture(scope="module")
@@ -121,15 +126,25 @@ def richer(asked) -> Paths:
     ).trace()
 
 
-@pytest.fixture
-def layers(asked, richer, monkeypatch) -> tuple[Paths, ...]:
+@pytest.fixture(scope="module")
+def layers(asked, richer) -> tuple[Paths, ...]:
     """All paths that the study leaves out, weak ones too."""
     trace = asked.setup.study.trace
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cheap_replay, "WEAK", 0.0)
+        return further_layers(richer, trace.max_depth, trace.diffraction)
+
+
+@pytest.fixture(scope="module")
+def layered(asked, richer, layers) -> ReplayedModel:
+    """A cheap model with further paths."""
+    parameters = with_constants(asked.parameters, richer.materials)
+    paths = with_layers(asked.setup.trace(), layers)
+    return ReplayedModel(Replay(paths, parameters), 3, ProblemRows(asked), len(layers))
+
+
+def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, richer, layers, monkeypatch):
     monkeypatch.setattr(cheap_replay, "WEAK", 0.0)
-    return further_layers(richer, trace.max_depth, trace.diffraction)
-
-
-def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, richer, layers):
     paths, depth = asked.setup.trace(), asked.setup.study.trace.max_depth
     assert len(layers) == 3
     assert paths.num_paths + sum(layer.num_paths for layer in layers) == richer.num_paths
@@ -145,29 +160,35 @@ def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, rich
 def test_weak_paths_are_left_out_of_the_layers(asked, richer, layers, monkeypatch):
     monkeypatch.setattr(cheap_replay, "WEAK", 1e-3)
     trace, power = asked.setup.study.trace, powers(richer)
-    share = power / np.bincount(richer.link, power)[richer.link]
+    total = np.bincount(richer.link, power)
     strong = further_layers(richer, trace.max_depth, trace.diffraction)
+    assert all((powers(layer) >= 1e-3 * total[layer.link]).all() for layer in strong)
     left_out = sum(layer.num_paths for layer in layers) - sum(layer.num_paths for layer in strong)
-    assert 0 < left_out <= (share < 1e-3).sum()
+    assert left_out == sum((powers(layer) < 1e-3 * total[layer.link]).sum() for layer in layers) > 0
 
 
-def test_gains_scale_the_power_of_the_layers(asked, richer, layers):
-    paths = asked.setup.trace()
-    parameters = with_constants(asked.parameters, richer.materials)
-    layered = Replay(with_layers(paths, layers), parameters)
-    model = ReplayedModel(layered, 3, ProblemRows(asked), len(layers))
+def test_gains_scale_the_power_of_the_layers(asked, richer, layered):
+    paths, parameters = asked.setup.trace(), layered.engine.parameters
     point = asked.parameters.to_search(asked.parameters.start)[None]
-    constants = model.constants.centre[: len(parameters) - 3]
+    constants = layered.constants.centre[: len(parameters) - 3]
     candidate = parameters.from_search(np.hstack([point, constants[None]]))
     all_paths, study_paths = (
         asked.residuals(candidate[:, :3], Replay(part, parameters).path_loss(candidate))
         for part in (richer, paths)
     )
     for log_gain, expected in ((0.0, all_paths), (-40.0, study_paths)):
-        gains = np.full(len(layers), log_gain)
-        answer = model.residuals(point, np.hstack([constants, gains])[None])
+        gains = np.full(layered.layers, log_gain)
+        answer = layered.residuals(point, np.hstack([constants, gains])[None])
         assert answer == pytest.approx(expected, abs=1e-6)
     assert np.abs(all_paths - study_paths).max() > 0.05
+
+
+def test_derivatives_with_further_paths_agree_with_the_residuals(asked, layered):
+    check_derivatives(asked, layered)
+    gains = layered.answer(
+        asked.parameters.to_search(asked.parameters.start)[None], layered.constants.centre[None]
+    ).by_constant[0, :, -layered.layers :]
+    assert (np.abs(gains).max(axis=0) > 1e-3).all()
 
 
 class Richer(Calls):
@@ -181,17 +202,14 @@ class Richer(Calls):
         return self.replay.path_loss(candidates)
 
 
-def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(asked, richer, layers):
-    layered = Replay(
-        with_layers(asked.setup.trace(), layers), with_constants(asked.parameters, richer.materials)
-    )
-    model, gain = ReplayedModel(layered, 3, ProblemRows(asked), len(layers)), []
+def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(asked, richer, layered):
+    gain = []
     for paths in (richer, asked.setup.trace()):
         engine = replace(asked, engine=Richer(paths, asked.parameters))
-        optimizer = choose(engine, model)
+        optimizer = choose(engine, layered)
         for _ in islice(rounds(optimizer, engine.evaluate), 5):
             pass
-        gain.append(np.exp(optimizer.corrected.constants[-model.layers :]))
+        gain.append(np.exp(optimizer.corrected.constants[-layered.layers :]))
     assert gain[0].max() > 0.5
     assert gain[1].max() < 0.1
 
