@@ -30,6 +30,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import choose, rounds
 from calibray.materials import Material
 from calibray.optimizers import LeastSquares
+from calibray.optimizers.multifidelity import space_mapping
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths, take
 from calibray.reporting.result_tables import costs
@@ -118,6 +119,12 @@ def test_derivatives_of_the_cheap_model_agree_with_its_residuals(asked, model):
 
 
 @pytest.fixture(scope="module")
+def own(asked) -> Paths:
+    """The paths that the study's settings find."""
+    return asked.setup.trace()
+
+
+@pytest.fixture(scope="module")
 def richer(asked) -> Paths:
     """The paths with up to two more interactions than the study allows, and with diffraction."""
     trace = asked.setup.study.trace
@@ -135,26 +142,40 @@ def layers(asked, richer) -> tuple[Paths, ...]:
         return further_layers(richer, trace.max_depth, trace.diffraction)
 
 
-@pytest.fixture(scope="module")
-def layered(asked, richer, layers) -> ReplayedModel:
+def with_further(asked: Problem, own: Paths, layers: tuple[Paths, ...]) -> ReplayedModel:
     """A cheap model with further paths."""
-    parameters = with_constants(asked.parameters, richer.materials)
-    paths = with_layers(asked.setup.trace(), layers)
+    paths = with_layers(own, layers)
+    parameters = with_constants(asked.parameters, paths.materials)
     return ReplayedModel(Replay(paths, parameters), 3, ProblemRows(asked), len(layers))
 
 
-def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, richer, layers, monkeypatch):
+@pytest.fixture(scope="module")
+def layered(asked, own, layers) -> ReplayedModel:
+    """A cheap model with all further paths."""
+    return with_further(asked, own, layers)
+
+
+@pytest.fixture(scope="module")
+def stronger(asked, own, richer) -> ReplayedModel:
+    """A cheap model with the stronger of the further paths, which is faster."""
+    trace = asked.setup.study.trace
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cheap_replay, "WEAK", 1e-4)
+        return with_further(asked, own, further_layers(richer, trace.max_depth, trace.diffraction))
+
+
+def test_the_study_and_the_layers_have_the_paths_of_the_richer_trace(asked, own, richer, layers, monkeypatch):
     monkeypatch.setattr(cheap_replay, "WEAK", 0.0)
-    paths, depth = asked.setup.trace(), asked.setup.study.trace.max_depth
+    depth = asked.setup.study.trace.max_depth
     assert len(layers) == 3
-    assert paths.num_paths + sum(layer.num_paths for layer in layers) == richer.num_paths
+    assert own.num_paths + sum(layer.num_paths for layer in layers) == richer.num_paths
     deeper, deepest, diffracted = layers
     assert set(np.diff(deeper.first)) == {depth + 1}
     assert set(np.diff(deepest.first)) == {depth + 2}
     assert (np.add.reduceat(diffracted.kind == Kind.DIFFRACTION, diffracted.first[:-1]) == 1).all()
     assert not (deeper.kind == Kind.DIFFRACTION).any()
     assert len(further_layers(richer, depth, True)) == 2
-    assert further_layers(paths, depth, False) == ()
+    assert further_layers(own, depth, False) == ()
 
 
 def test_weak_paths_are_left_out_of_the_layers(asked, richer, layers, monkeypatch):
@@ -167,14 +188,14 @@ def test_weak_paths_are_left_out_of_the_layers(asked, richer, layers, monkeypatc
     assert left_out == sum((powers(layer) < 1e-3 * total[layer.link]).sum() for layer in layers) > 0
 
 
-def test_gains_scale_the_power_of_the_layers(asked, richer, layered):
-    paths, parameters = asked.setup.trace(), layered.engine.parameters
+def test_gains_scale_the_power_of_the_layers(asked, own, richer, layered):
+    parameters = layered.engine.parameters
     point = asked.parameters.to_search(asked.parameters.start)[None]
     constants = layered.constants.centre[: len(parameters) - 3]
     candidate = parameters.from_search(np.hstack([point, constants[None]]))
     all_paths, study_paths = (
         asked.residuals(candidate[:, :3], Replay(part, parameters).path_loss(candidate))
-        for part in (richer, paths)
+        for part in (richer, own)
     )
     for log_gain, expected in ((0.0, all_paths), (-40.0, study_paths)):
         gains = np.full(layered.layers, log_gain)
@@ -183,11 +204,11 @@ def test_gains_scale_the_power_of_the_layers(asked, richer, layered):
     assert np.abs(all_paths - study_paths).max() > 0.05
 
 
-def test_derivatives_with_further_paths_agree_with_the_residuals(asked, layered):
-    check_derivatives(asked, layered)
-    gains = layered.answer(
-        asked.parameters.to_search(asked.parameters.start)[None], layered.constants.centre[None]
-    ).by_constant[0, :, -layered.layers :]
+def test_derivatives_with_further_paths_agree_with_the_residuals(asked, stronger):
+    check_derivatives(asked, stronger)
+    gains = stronger.answer(
+        asked.parameters.to_search(asked.parameters.start)[None], stronger.constants.centre[None]
+    ).by_constant[0, :, -stronger.layers :]
     assert (np.abs(gains).max(axis=0) > 1e-3).all()
 
 
@@ -202,14 +223,17 @@ class Richer(Calls):
         return self.replay.path_loss(candidates)
 
 
-def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(asked, richer, layered):
+def test_answers_show_whether_the_engine_has_the_paths_of_the_layers(
+    asked, own, richer, stronger, monkeypatch
+):
+    monkeypatch.setattr(space_mapping, "FIRST_SEARCHES", 8)
     gain = []
-    for paths in (richer, asked.setup.trace()):
+    for paths in (richer, own):
         engine = replace(asked, engine=Richer(paths, asked.parameters))
-        optimizer = choose(engine, layered)
+        optimizer = choose(engine, stronger)
         for _ in islice(rounds(optimizer, engine.evaluate), 5):
             pass
-        gain.append(np.exp(optimizer.corrected.constants[-layered.layers :]))
+        gain.append(np.exp(optimizer.corrected.constants[-stronger.layers :]))
     assert gain[0].max() > 0.5
     assert gain[1].max() < 0.1
 
