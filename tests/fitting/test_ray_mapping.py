@@ -403,6 +403,25 @@ def test_calls_go_on_while_the_minimum_is_not_at_the_best_call(
     assert len(mapped.calls) == 3
 
 
+def test_the_assumptions_are_searched_at_most_three_times(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No assumptions explain this engine, so each search would end without success, after minutes."""
+    search, searched = ray_fit._search, []
+
+    def counted(*arguments: object) -> ray_fit.Understanding:
+        searched.append(arguments)
+        return search(*arguments)
+
+    monkeypatch.setattr(ray_fit, "TRIALS", 0)
+    monkeypatch.setattr(ray_fit, "_scanned", lambda *_: [])
+    monkeypatch.setattr(ray_fit, "_search", counted)
+    mapped = map_rays(foreign.problem, replace(foreign, ripple=0.1), tolerance_db=1e-12, most_calls=7)
+    assert len(mapped.calls) == 7
+    assert len(searched) == 3
+    assert mapped.understanding.misfit_db > 0.2
+
+
 def test_a_lower_minimum_that_one_search_missed_leads_to_a_further_call(
     foreign: Foreign, mapped: RayMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,12 +104,18 @@ class Ratio(NamedTuple):
 
 
 def understand(
-    parameters: Parameters, calls: list[Call], known: bool, before: Understanding | None = None
+    parameters: Parameters,
+    calls: list[Call],
+    known: bool,
+    before: Understanding | None = None,
+    *,
+    search: bool = True,
 ) -> Understanding:
     """Find the assumptions that explain the ratios of all calls.
 
-    If `before` is given (the assumptions found from the earlier calls), the search starts from it. The
-    model contains the paths of the last call. `known` is true if the program's antennas are those of the engine.
+    If `before` is given (the assumptions found from the earlier calls), the search starts from it. If `search` is
+    false, `before` is only refined. The model contains the paths of the last call. `known` is true if the program's
+    antennas are those of the engine.
     """
     last, ratios = calls[-1], ratios_of(calls)
     model = RayModel.of(parameters, last.export.paths, known)
@@ -122,7 +128,7 @@ def understand(
         )
     if before is not None and before.model.assumed == model.assumed:
         before = refined(replace(before, model=model), ratios, last, EVALUATIONS[2])
-        if before.misfit_db <= KNOWN_DB:
+        if before.misfit_db <= KNOWN_DB or not search:
             return before
     return _search(first, ratios, last, before)
 

@@ -78,6 +78,10 @@ LEAST_CALLS: Final = 3
 MOST_CALLS: Final = 10
 """Maximum number of calls in ray mapping."""
 
+SEARCHED: Final = 4
+"""Number of calls up to which the assumptions are searched globally; after further calls, they are only refined. In 174
+runs with engines that the model represents, at most five calls were made."""
+
 
 @dataclass(frozen=True, eq=False)
 class RayMap:
@@ -198,7 +202,6 @@ def map_rays(
     called through `ask`, never through `problem`.
     """
     parameters, known = problem.parameters, problem.setup.known_antennas is not None
-    understanding: Understanding | None = None
 
     def call(candidate: NDArray[np.float64]) -> Call:
         export = ask(candidate)
@@ -212,25 +215,27 @@ def map_rays(
     calls = [call(parameters.start)]
     calls.append(call(_most_informative(problem, calls[0], np.random.default_rng(seed))))
     ordered, further = calls, np.empty((0, len(parameters)))
+    understanding = understand(parameters, calls, known)
     while True:
-        understanding = understand(parameters, ordered, known, understanding)
         replay = understanding.replay(parameters, ordered[-1])
         starts = parameters.to_search(np.array([candidate for candidate, _ in calls]))
         minimum = _search_replay(problem, replay, np.vstack([starts, further]), len(calls)).best.x
         calls = [*calls, call(parameters.from_search(minimum))]
-        ordered = calls
-        gap = _gap(replay, calls[-1])
-        if gap > tolerance_db and len(calls) < most_calls:
+        gap, last = _gap(replay, calls[-1]), len(calls) >= most_calls
+        predicted = gap <= tolerance_db or last
+        # The model contains the rays of the last call in this order.
+        ordered = _best_last(problem, calls) if predicted else calls
+        search = len(calls) <= SEARCHED
+        understanding = understand(parameters, ordered, known, understanding, search=search)
+        if not predicted:
             continue
-        mapped = _finish(problem, calls, known, understanding, gap)
+        mapped = _finish(problem, calls, understanding, gap)
         # Links that lose their paths at the minimum make the objective infinite there, so no call can become the best.
         repeated = (
             all(np.isinf(_objective(problem, each)) for each in calls[-2:]) and len(calls) > LEAST_CALLS
         )
-        if mapped.moved_db <= LEFT_DB or repeated or len(calls) >= most_calls:
+        if mapped.moved_db <= LEFT_DB or repeated or last:
             return mapped
-        # The model contains the rays of the last call, in this order.
-        ordered, understanding = _best_last(problem, calls), mapped.understanding
         further = mapped.minima[:1]
 
 
@@ -243,13 +248,14 @@ def _search_replay(problem: Problem, replay: Replay, starts: NDArray[np.float64]
     return least_squares(with_engine(problem, replay), searches, starts, seed=calls)
 
 
-def _finish(
-    problem: Problem, calls: list[Call], known: bool, understanding: Understanding, gap: float
-) -> RayMap:
-    """The ray mapping, with the replay that agrees with the engine at the best call."""
+def _finish(problem: Problem, calls: list[Call], understanding: Understanding, gap: float) -> RayMap:
+    """The ray mapping, with the replay that agrees with the engine at the best call.
+
+    `understanding` contains the assumptions found from all calls, with the best call last.
+    """
     parameters, ordered = problem.parameters, _best_last(problem, calls)
-    final, best = understand(parameters, ordered, known, understanding), ordered[-1]
-    replay = final.replay(parameters, best)
+    best = ordered[-1]
+    replay = understanding.replay(parameters, best)
     replayed, point = with_engine(problem, replay), parameters.to_search(best.candidate)[None]
     found = _search_replay(problem, replay, point, len(calls))
     remaining = float(replayed.squares(point).value[0]) - found.best.y
@@ -259,8 +265,8 @@ def _finish(
     lost = max(lost, int((np.isfinite(answered) & np.isinf(predicted)).sum()))
     moved = _distance(lowest, predicted)
     return RayMap(
-        replay, tuple(calls), best, final, gap, changed, changed_db, lost, half_spaces(final, ordered), found.minima,
-        remaining, moved,
+        replay, tuple(calls), best, understanding, gap, changed, changed_db, lost,
+        half_spaces(understanding, ordered), found.minima, remaining, moved,
     )  # fmt: skip
 
 
