@@ -11,7 +11,7 @@ from calibray.fields import path_loss
 from calibray.materials import Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import take
-from problem_families import problems
+from problem_families import family, problems
 from problem_families.family import LINKS, NOISE_DB, PARAMETERS, PlantedProblem, problem
 from problem_families.numpy_replay import NumpyReplay
 from problem_families.sites import district_site, office_site
@@ -36,6 +36,8 @@ def replay():
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(family, "SAMPLES", 10_000)
+        patch.setattr(family, "STARTS", 8)
         patch.setenv("CALIBRAY_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield problem(2)
 
