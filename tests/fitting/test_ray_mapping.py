@@ -403,7 +403,7 @@ def test_calls_go_on_while_the_minimum_is_not_at_the_best_call(
     assert len(mapped.calls) == 3
 
 
-def test_the_assumptions_are_searched_at_most_three_times(
+def test_the_assumptions_are_searched_at_most_four_times(
     foreign: Foreign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No assumptions explain this engine, so each search would end without success, after minutes."""
@@ -418,8 +418,27 @@ def test_the_assumptions_are_searched_at_most_three_times(
     monkeypatch.setattr(ray_fit, "_search", counted)
     mapped = map_rays(foreign.problem, replace(foreign, ripple=0.1), tolerance_db=1e-12, most_calls=7)
     assert len(mapped.calls) == 7
-    assert len(searched) == 3
+    assert len(searched) == 4
     assert mapped.understanding.misfit_db > 0.2
+
+
+def test_a_distant_call_tests_a_replay_whose_assumptions_are_not_identified(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Calls near a minimum do not show whether there is a lower minimum elsewhere."""
+    monkeypatch.setattr(ray_fit, "TRIALS", 0)
+    monkeypatch.setattr(ray_fit, "_scanned", lambda *_: [])
+    rippled = replace(foreign, ripple=0.03)
+    mapped = map_rays(foreign.problem, rippled, most_calls=8)
+    assert mapped.understanding.misfit_db > 0.2
+    assert 0.2 < mapped.distant_gap_db < 1.0
+    assert mapped.reached
+    assert not mapped.understood
+    value = np.array([call.candidate[0] for call in mapped.calls])
+    nearest = [np.abs(value[:k] - value[k]).min() for k in range(2, len(value))]
+    assert np.sort(nearest)[-2:] == pytest.approx([3.5, 4.5], abs=1.0)  # the third call, and the distant one
+    text = remark_text(ray_mapping._remark(mapped, foreign.problem))
+    assert f"and at a distant call to within {mapped.distant_gap_db:.2f} dB" in text
 
 
 def test_a_lower_minimum_that_one_search_missed_leads_to_a_further_call(
@@ -450,7 +469,8 @@ def test_a_lower_minimum_that_one_search_missed_leads_to_a_further_call(
 def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
     """Misfit and changed paths matter for the replay elsewhere, the gap and the remaining gain for the optimum."""
     assert replace(mapped, gap_db=0.19).reached
-    misfit = replace(mapped, understanding=replace(mapped.understanding, misfit_db=0.5))
+    untested = replace(mapped, understanding=replace(mapped.understanding, misfit_db=0.5))
+    misfit = replace(untested, distant_gap_db=0.9)
     for foreign in (misfit, replace(mapped, changed_db=0.6)):
         assert foreign.reached
         assert not foreign.understood
@@ -459,6 +479,8 @@ def test_the_optimum_is_reached_without_understanding(mapped: RayMap) -> None:
         replace(mapped, remaining_db=0.06),
         replace(mapped, moved_db=0.06),
         replace(mapped, lost=1),
+        untested,
+        replace(untested, distant_gap_db=1.1),
     ):
         assert not missed.reached
         assert not missed.understood

@@ -306,6 +306,8 @@ def _ray_mapping(values: dict[str, Any]) -> str:
         text += f" with {constants}." if constants else "."
     else:
         optimum = "the optimum is probably reached" if values["reached"] else "the optimum may be missed"
+        if "distant_gap_db" in values:
+            text += f", and at a distant call to within {values['distant_gap_db']:.2f} dB"
         text = (
             f"The model does not represent the program. {text}. The model is replaced by a replay that agrees with the "
             f"program at the best call. The minimum of this replay is {values['remaining_db']:.3f} dB below that call, "
