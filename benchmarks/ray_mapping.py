@@ -318,8 +318,8 @@ def repetition(place: Place, foreign: Foreign, name: str, seed: int, most_calls:
         "place": place.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
         "calls": next((k + 1 for k, value in enumerate(excess.tolist()) if value <= REACHED_DB), FAILED),
         "made": len(excess), "excess_db": excess.round(6).tolist(), "misfit_db": mapped.understanding.misfit_db,
-        "gap_db": mapped.gap_db, "changed_db": mapped.changed_db, "remaining_db": mapped.remaining_db,
-        "moved_db": mapped.moved_db,
+        "gap_db": mapped.gap_db, "distant_gap_db": mapped.distant_gap_db, "changed_db": mapped.changed_db,
+        "remaining_db": mapped.remaining_db, "moved_db": mapped.moved_db,
         "reached": mapped.reached, "understood": mapped.understood, "seconds": seconds,
     }  # fmt: skip
 

@@ -4,8 +4,8 @@ A few calls are enough. Each call returns the power of each path. The ratio of a
 not depend on antenna gains or units. The ratios therefore reveal the engine's assumptions: thickness, conductivity,
 slabs or half-spaces, and the polarization of its antennas. We fit these assumptions to all ratios of the calls so far
 (`ray_fit.py`). The power of every path is then corrected to agree with the last call. The next call is at the minimum
-of this corrected replay and so tests the replay. If the assumptions are not identified, one more call tests the replay
-far from all other calls.
+of this corrected replay and so tests the replay. If the assumptions are not identified, calls far from all others also
+test the replay, until one of them is predicted.
 
 The first call is at the initial values. The second call is at the point where the ratios are most informative about the
 assumed constants. Among `PROBES` random points, this point has the largest mean log determinant of the information
@@ -209,7 +209,7 @@ def map_rays(
 
     The result contains the replay that replaces the engine, and the accuracy of this replay. Calls also continue if the
     minimum of the replay is not at the best call: an accurate prediction over a short step does not show that the model
-    is accurate elsewhere. For the same reason, one call is made far from all others if the assumptions are not
+    is accurate elsewhere. For the same reason, calls far from all others are made if the assumptions are not
     identified. Calling stops if links lose all their paths in two successive calls at minima. The engine is called
     through `ask`, never through `problem`.
     """
