@@ -435,8 +435,9 @@ def test_a_distant_call_tests_a_replay_whose_assumptions_are_not_identified(
     assert mapped.reached
     assert not mapped.understood
     value = np.array([call.candidate[0] for call in mapped.calls])
-    nearest = [np.abs(value[:k] - value[k]).min() for k in range(2, len(value))]
-    assert np.sort(nearest)[-2:] == pytest.approx([3.5, 4.5], abs=1.0)  # the third call, and the distant one
+    nearest = [np.abs(value[:k] - value[k]).min() for k in range(3, len(value))]
+    assert sorted(nearest)[-2] < 0.5  # calls at minima
+    assert max(nearest) > 3.0
     text = remark_text(ray_mapping._remark(mapped, foreign.problem))
     assert f"and at a distant call to within {mapped.distant_gap_db:.2f} dB" in text
 
