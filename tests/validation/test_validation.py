@@ -163,7 +163,7 @@ def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
     )
     assert near.choice in near.summary()[2]
     assert near.content()["chosen"] == Model.INITIAL
-    # With many links the bootstrap error is small, and a gain of 3 % is certain but too small.
+    # With many links the bootstrap standard error is small, and a gain of 3 % is certain but too small.
     base = synthetic_validation({Model.INITIAL: 3.0, Model.CALIBRATED: 3.0}).errors[Model.INITIAL]
     scaled = replace(
         near, errors={Model.INITIAL: base, Model.CALIBRATED: 0.97 * base}, block=np.zeros(len(base), int)

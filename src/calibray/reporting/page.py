@@ -71,8 +71,8 @@ CAPTIONS: Final = {
     "observables": "Measured versus modelled values of further observables, link by link, without device biases. "
     "The line marks equal values.",
     "residual-by-direction": "Predicted minus measured path loss around each transmitter, by compass direction: points "
-    "outside the black circle received more power than predicted. Orange: the stated antenna pattern on the horizon, "
-    "from its maximum at the rim to 30 dB below this maximum at the centre.",
+    "outside the black circle received more power than predicted. Orange: the stated horizontal antenna pattern, from "
+    "its maximum at the rim to 30 dB below this maximum at the centre.",
     "residual-by-group": "Residual by group: median, quartiles, and whiskers that contain 90 % of the links.",
 }
 

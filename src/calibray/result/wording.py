@@ -456,9 +456,9 @@ _BASELINES: Final[dict[str, str]] = {
 def judgement_text(judgement: Judgement) -> str:
     """State by how much calibration improves on the best baseline on held-out links, and how certain this gain is."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {counted(judgement.links, 'held-out link')}"
-    certainty = "no bootstrap error: one cluster of links"
+    certainty = "no bootstrap standard error: one cluster of links"
     if judgement.error_db is not None:
-        certainty = f"bootstrap error {judgement.error_db:.2f} dB"
+        certainty = f"bootstrap standard error {judgement.error_db:.2f} dB"
     name = _BASELINES.get(judgement.baseline, judgement.baseline)
     baseline = f"than {name}, the best baseline ({certainty})"
     if judgement.gain_db <= 0:

@@ -136,7 +136,7 @@ def compare(errors: NDArray[np.float64], baselines: Errors, position: NDArray[np
 def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the prediction model by held-out residuals [n], [dB], which must include those of `Model.INITIAL`.
 
-    The initial materials are kept unless another model is better by more than both the bootstrap error of the
+    The initial materials are kept unless another model is better by more than both the bootstrap standard error of the
     difference and `LEAST_GAIN`. Kriging is never chosen, because it predicts well only near the measured links.
     """
     chosen: str = Model.INITIAL
