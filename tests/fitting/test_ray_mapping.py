@@ -520,6 +520,35 @@ def test_a_link_that_loses_its_paths_at_the_minimum_ends_the_calls_and_is_named(
     assert 'set objective.no_path = "censor" and objective.ceiling_db' in text
 
 
+def test_a_link_that_loses_its_paths_at_a_distant_call_does_not_end_the_calls(
+    foreign: Foreign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link also loses its paths at the next minimum, but keeps them at the minimum after that."""
+    monkeypatch.setattr(ray_fit, "TRIALS", 0)
+    monkeypatch.setattr(ray_fit, "_scanned", lambda *_: [])
+    rippled, distant, answers = replace(foreign, ripple=0.03), ray_mapping._distant, []
+    without: list[int] = []
+
+    def chosen(problem: Problem, calls: list[Call]) -> np.ndarray:
+        if not without:
+            without.extend([len(calls) + 1, len(calls) + 2])
+        return distant(problem, calls)
+
+    def ask(candidate: np.ndarray) -> Export:
+        table = rippled.rays(candidate)
+        kept = np.flatnonzero((foreign.paths.link != 1) | (len(answers) + 1 not in without))
+        answers.append(Export.of_table(table.take(kept), RaySetting.of(foreign.problem.setup)))
+        return answers[-1]
+
+    monkeypatch.setattr(ray_mapping, "_distant", chosen)
+    monkeypatch.setattr(ray_mapping, "GAP_DB", 10.0)  # every prediction counts as accurate
+    monkeypatch.setattr(ray_mapping, "LEFT_DB", -1.0)  # calls do not end because the optimum is reached
+    mapped = map_rays(foreign.problem, ask, tolerance_db=10.0, most_calls=6)
+    reached = [bool(np.isfinite(answer.path_loss_db[1])) for answer in answers]
+    assert [number for number, found in enumerate(reached, 1) if not found] == without
+    assert len(mapped.calls) > without[-1]
+
+
 def test_a_link_that_the_replay_lacks_is_lost(foreign: Foreign, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = ray_fit.Understanding.replay
 

@@ -231,12 +231,14 @@ def map_rays(
     calls.append(call(_most_informative(problem, calls[0], np.random.default_rng(seed))))
     ordered, further = calls, np.empty((0, len(parameters)))
     understanding, distant_gap = understand(parameters, calls, known), np.inf
+    lost = 0  # successive calls at minima that have an infinite objective
     while True:
         replay = understanding.replay(parameters, ordered[-1])
         starts = parameters.to_search(np.array([candidate for candidate, _ in calls]))
         minimum = _search_replay(problem, replay, np.vstack([starts, further]), len(calls)).best.x
         calls = [*calls, call(parameters.from_search(minimum))]
         gap, last = _gap(replay, calls[-1]), len(calls) >= most_calls
+        lost = lost + 1 if np.isinf(_objective(problem, calls[-1])) else 0
         predicted = gap <= tolerance_db or last
         # The model contains the rays of the last call in this order.
         ordered = _best_last(problem, calls) if predicted else calls
@@ -252,10 +254,7 @@ def map_rays(
             continue
         mapped = _finish(problem, calls, understanding, gap, distant_gap)
         # Links that lose their paths at the minimum make the objective infinite there, so no call can become the best.
-        repeated = (
-            all(np.isinf(_objective(problem, each)) for each in calls[-2:]) and len(calls) > LEAST_CALLS
-        )
-        if mapped.moved_db <= LEFT_DB or repeated or last:
+        if mapped.moved_db <= LEFT_DB or lost >= 2 or last:
             return mapped
         further = mapped.minima[:1]
 
